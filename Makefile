@@ -1,0 +1,24 @@
+# Two commands for users, two more for developers; each works on a machine with python3 and make only.
+VENV := .venv
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test test-all lint
+demo: $(STAMP)
+	$(VENV)/bin/jaxsat demo
+
+test: $(STAMP) lint
+	$(VENV)/bin/python -m pytest -m "not slow"
+
+test-all: $(STAMP) lint
+	$(VENV)/bin/python -m pytest
+
+lint: $(STAMP)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/pyright
+
+$(STAMP): pyproject.toml
+	python3 -m venv $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)/bin/python -m pip install --quiet --editable ".[dev]"
+	touch $@

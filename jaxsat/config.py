@@ -1,0 +1,151 @@
+"""Validated configuration: one tree of plain values, read from TOML, in SI units."""
+
+import difflib
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from jaxsat.errors import InputError
+
+Method = Literal["standard", "direct", "triangle", "quadratic"]
+RailSetting = Literal["auto", "none"] | float
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Noise(_Section):
+    """Sensor noise as densities, and how still a rest is."""
+
+    gyr_density: float = Field(default=7e-4, gt=0, description="angular-rate noise density (rad/s/√Hz)")
+    acc_density: float = Field(default=7e-3, gt=0, description="specific-force noise density (m/s²/√Hz)")
+    rest_velocity_sd: float = Field(
+        default=0.01, gt=0, description="sd of the velocity of a resting sensor (m/s)"
+    )
+    initial_tilt_sd: float = Field(
+        default=0.005, gt=0, description="sd of the initial tilt, mostly accelerometer bias (rad)"
+    )
+
+
+class Rests(_Section):
+    """When the sensor stands still."""
+
+    detector: Literal["shoe", "ared", "amvd", "mag"] = "shoe"
+    threshold: Literal["auto"] | float = "auto"
+    window: float = Field(default=0.04, gt=0, description="length of the detector's window (s)")
+    min_duration: float = Field(default=0.1, ge=0, description="shorter rests are dropped (s)")
+
+
+class Rails(_Section):
+    """Saturation limits: found in the recording, absent, or given as one magnitude for the three axes."""
+
+    gyr: RailSetting = Field(default="auto", description="gyroscope limit (rad/s)")
+    acc: RailSetting = Field(default="auto", description="accelerometer limit (m/s²)")
+
+
+class Saturation(_Section):
+    """How saturated samples are filled."""
+
+    gyr_bound: float = Field(
+        default=10.0, gt=0, description="most that a true rate exceeds its rail, δ_b (rad/s)"
+    )
+    acc_bound: float = Field(default=100.0, gt=0, description="the same for specific force (m/s²)")
+    segments: Literal["parallel", "sequential"] = "parallel"
+    sweeps: int = Field(default=2, ge=1, le=20, description="passes over all segments when they are parallel")
+    free_peak_time: bool = Field(
+        default=False, description="search the peak time of a triangle or parabola too"
+    )
+    tolerance: float = Field(
+        default=1e-3, gt=0, description="largest accepted optimality residual (scaled, per variable)"
+    )
+    max_iterations: int = Field(default=500, ge=1)
+
+
+class Height(_Section):
+    """What is known of the height of rests, relative to the first one."""
+
+    mode: Literal["off", "zero", "nonnegative"] = "off"
+    sd: float = Field(default=0.01, gt=0, description="sd of the height of a rest in mode `zero` (m)")
+
+
+class Smoother(_Section):
+    """The whole-trial smoother."""
+
+    relinearisations: int = Field(default=1, ge=0, le=20, description="Gauss-Newton steps after the first")
+    gyr_offset: Literal["first_rest", "none"] = Field(
+        default="first_rest", description="constant rate to remove"
+    )
+
+
+class Config(_Section):
+    """Everything that `estimate` can be told; unknown keys are errors."""
+
+    method: Method = "direct"
+    gravity: Literal["auto"] | float = Field(
+        default="auto", description="magnitude (m/s²); auto: |a| over the first rest"
+    )
+    noise: Noise = Noise()
+    rests: Rests = Rests()
+    rails: Rails = Rails()
+    saturation: Saturation = Saturation()
+    height: Height = Height()
+    smoother: Smoother = Smoother()
+
+
+def load_config(path: Path | None = None, **overrides: Any) -> Config:
+    """Configuration from a TOML file, with dotted overrides (`{"rails.gyr": 5.2}`) on top.
+
+    Raises `InputError` that names the file, the key, and for an unknown key the nearest known one.
+    """
+    tree: dict[str, Any] = {}
+    where = "configuration"
+    if path is not None:
+        where = str(path)
+        try:
+            tree = tomllib.loads(Path(path).read_text())
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot read the configuration ({error.strerror}); check the path."
+            ) from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: not valid TOML ({error}); correct that line.") from None
+    for key, value in overrides.items():
+        node, *parents, leaf = [tree, *key.split(".")]
+        for part in parents:
+            node = node.setdefault(part, {})
+        node[leaf] = value
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        raise InputError(f"{where}: {_sentence(error)}") from None
+
+
+def _known_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        yield prefix + name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _known_keys(field.annotation, f"{prefix}{name}.")
+
+
+def _sentence(error: ValidationError) -> str:
+    first = error.errors()[0]
+    parts = [str(part) for part in first["loc"]]
+    known = list(_known_keys(Config))
+    if first["type"] == "extra_forbidden":
+        key = ".".join(parts)
+        by_leaf = {name.rsplit(".", 1)[-1]: name for name in known}
+        near = difflib.get_close_matches(key, known, 1, 0.5)
+        near = near or [by_leaf[m] for m in difflib.get_close_matches(parts[-1], by_leaf, 1, 0.5)]
+        hint = f"; did you mean '{near[0]}'?" if near else f"; known keys are {', '.join(known)}."
+        return f"unknown key '{key}'{hint}"
+    # The location of a union ends with the name of the alternative that failed.
+    key = max(
+        (".".join(parts[:n]) for n in range(len(parts) + 1) if ".".join(parts[:n]) in known),
+        key=len,
+        default="",
+    )
+    return f"'{key}' is {first['input']!r}, but {first['msg'][0].lower()}{first['msg'][1:]}."

@@ -1,0 +1,272 @@
+"""The pipeline: a recording and a configuration in, a trajectory out."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxsat.config import Config
+from jaxsat.errors import InputError
+from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
+from jaxsat.inertial.smoother import ActiveSet, Rows, Smoothed, smooth, smooth_nonnegative
+from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
+from jaxsat.saturation.compensate import Fills, Options, compensate_parallel, compensate_sequential
+from jaxsat.saturation.layout import Layout, Trial
+from jaxsat.signals.checks import check
+from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
+from jaxsat.signals.recording import Recording
+from jaxsat.signals.rests import Segments, find_rests, find_segments
+
+# A recording may start up to so long before its first rest; what it did until then is integrated backwards.
+LATEST_FIRST_REST = 1.0
+# A gyroscope offset is taken from a first rest of at least this length; a shorter one tells less than it costs.
+SHORTEST_OFFSET_REST = 1.0
+# sd of the unknown velocity of a sensor that does not start at rest (m/s).
+MOVING_START_SD = 3.0
+
+
+class Trajectory(eqx.Module):
+    """States at the start of each sample, with their covariance."""
+
+    time: Float[np.ndarray, "N"]
+    q_nb: Float[np.ndarray, "N 4"]
+    position: Float[np.ndarray, "N 3"]
+    velocity: Float[np.ndarray, "N 3"]
+    covariance: Float[np.ndarray, "N 9 9"]
+    """Of [attitude error θ (rad, navigation frame), position, velocity]."""
+
+
+class Estimate(eqx.Module):
+    """All that `estimate` found."""
+
+    recording: Recording
+    config: Config = eqx.field(static=True)
+    trajectory: Trajectory
+    rails: Rails
+    rest: Bool[np.ndarray, "N"]
+    segments: Segments
+    gaps: Gaps
+    sign: Int[np.ndarray, "N 6"]
+    """Direction of saturation of each value, 0 where there is none."""
+    filled: Float[np.ndarray, "N 6"]
+    """The recording's six channels with saturated values replaced (rad/s, m/s²)."""
+    signal_sd: Float[np.ndarray, "N 6"]
+    """sd of each value of `filled`: sensor noise, or where it was filled by methods 1 and 2 that of a value
+    anywhere within its bounds, because they do not say more."""
+    fills: Fills
+    cost: Float[np.ndarray, ""]
+    """J* of the whole recording as reported."""
+    cost_standard: Float[np.ndarray, ""]
+    """J* of the whole recording with saturation ignored."""
+    gravity: float
+    gyr_offset: Float[np.ndarray, "3"]
+    floor: ActiveSet | None
+    """Active set of `height.mode = "nonnegative"`."""
+    warnings: list[str] = eqx.field(static=True)
+    seconds: dict[str, float] = eqx.field(static=True)
+
+    @property
+    def saturated(self) -> Bool[np.ndarray, "N 6"]:
+        return self.sign != 0
+
+
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, steps done, steps in all)."""
+
+
+def estimate(
+    recording: Recording, config: Config | None = None, *, progress: Progress | None = None
+) -> Estimate:
+    """Reconstruct the trajectory of a recording, saturated or not.
+
+    Computed in float64 whatever JAX's setting. Raises `InputError` where the recording cannot give a
+    trajectory: no gyroscope, no rest at its start, units that cannot be.
+    """
+    config = config or Config()
+    with jax.enable_x64(True):
+        return _estimate(recording, config, progress or (lambda *_: None))
+
+
+def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
+    clock = _Clock()
+    warnings = check(recording)
+    rails = find_rails(recording, config.rails.gyr, config.rails.acc)
+    saturated, sign = saturation_mask(recording, rails)
+    at_rail = np.any(saturated, axis=1)
+    rest = find_rests(
+        recording,
+        config.rests.detector,
+        config.rests.threshold,
+        config.rests.window,
+        config.rests.min_duration,
+        at_rail,
+    )
+    rest = rest & ~at_rail & ~recording.missing.all(axis=1)
+    segments, gaps = find_segments(rest), find_gaps(sign)
+    clock.lap("signals")
+
+    trial, offset = _trial(recording, config, rest, sign)
+    layout = Layout.of(trial, segments, gaps)
+    fills = Fills.nothing(trial, len(segments))
+    standard, floor = _smooth(trial, config)
+    smoothed = standard
+    clock.lap("smoother")
+    if config.method != "standard" and len(gaps):
+        options = Options(
+            config.method,
+            config.saturation.free_peak_time,
+            config.saturation.max_iterations,
+            jnp.asarray(config.saturation.tolerance),
+        )
+        report = partial(progress, "segments")
+        # An inequality acts on the whole trajectory only: a single segment is searched without it.
+        searched = trial
+        if config.height.mode == "nonnegative":
+            searched = eqx.tree_at(lambda t: t.rows.height, trial, jnp.zeros(len(rest), bool))
+        if config.saturation.segments == "parallel":
+            fills = compensate_parallel(searched, layout, options, config.saturation.sweeps, report)
+        else:
+            fills = compensate_sequential(searched, layout, options, report)
+        clock.lap("compensation")
+        smoothed, floor = _smooth(eqx.tree_at(lambda t: t.signal, trial, fills.signal), config)
+        clock.lap("smoother")
+
+    n = len(recording)
+    sensor_sd = np.sqrt(trial.variance)
+    offsets = np.concatenate([offset, np.zeros(3)])
+    filled = np.where(sign != 0, fills.signal + offsets, recording.signal)
+    return Estimate(
+        recording=recording,
+        config=config,
+        trajectory=Trajectory(
+            time=recording.time,
+            q_nb=np.asarray(smoothed.state.q_nb)[:n],
+            position=np.asarray(smoothed.state.position)[:n],
+            velocity=np.asarray(smoothed.state.velocity)[:n],
+            covariance=np.asarray(smoothed.covariance)[:n],
+        ),
+        rails=rails,
+        rest=rest,
+        segments=segments,
+        gaps=gaps,
+        sign=sign,
+        filled=filled,
+        signal_sd=np.where(sign != 0, trial.bound / np.sqrt(12.0), sensor_sd),
+        fills=fills,
+        cost=np.asarray(smoothed.cost),
+        cost_standard=np.asarray(standard.cost),
+        gravity=float(trial.gravity),
+        gyr_offset=offset,
+        floor=floor,
+        warnings=warnings,
+        seconds=clock.seconds,
+    )
+
+
+class _Clock:
+    """Seconds spent in each stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + now - self._last, 3)
+        self._last = now
+
+
+def _trial(
+    recording: Recording, config: Config, rest: Bool[np.ndarray, "N"], sign: Int[np.ndarray, "N 6"]
+) -> tuple[Trial, Float[np.ndarray, "3"]]:
+    """The recording as the smoother wants it, and the gyroscope offset that was taken off (rad/s)."""
+    n, T, signal = len(recording), recording.period, recording.signal
+    started = np.flatnonzero(rest)
+    if not len(started) or started[0] * T > LATEST_FIRST_REST:
+        when = f"only at {started[0] * T:.1f} s" if len(started) else "nowhere"
+        raise InputError(
+            f"{recording.name}: no rest at the start (the sensor rests {when}); start recordings with the "
+            f"sensor still, cut what comes before the first rest, or give a rest column."
+        )
+    first = int(started[0])
+    moving = np.flatnonzero(~rest[first:])
+    first_rest = slice(first, first + int(moving[0]) if len(moving) else n)
+    length = first_rest.stop - first_rest.start
+    # The first rest at a foot's first step includes its first stir: leave out its last tenth of a second.
+    quiet = slice(first, max(first + 1, first_rest.stop - round(0.1 / T)))
+
+    offset = np.zeros(3)
+    if config.smoother.gyr_offset == "first_rest" and length * T >= SHORTEST_OFFSET_REST:
+        offset = signal[quiet, :3].mean(axis=0)
+    signal = signal - np.concatenate([offset, np.zeros(3)])
+    up = signal[quiet, 3:].mean(axis=0)
+    gravity = np.linalg.norm(up) if config.gravity == "auto" else float(config.gravity)
+
+    # Density to per-sample variance; a value that was not measured may be anything the channel did.
+    noise, limits = config.noise, config.saturation
+    density = np.repeat([noise.gyr_density, noise.acc_density], 3)
+    variance = np.where(recording.missing, np.maximum(signal.var(axis=0), density**2 / T), density**2 / T)
+
+    # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope.
+    q_nb = quat_between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
+    velocity = jnp.zeros(3)
+    if first > 0:
+        early = prefixes(sample_intervals(jnp.asarray(signal[:first]), jnp.full(first, T)))
+        q_nb = quat_multiply(q_nb, quat_conjugate(early.rotation[-1]))
+    tilt = noise.initial_tilt_sd**2
+    speed = MOVING_START_SD**2 if first > 0 else noise.rest_velocity_sd**2
+    # Tilt is horizontal in the navigation frame; heading and position are the origin of the map.
+    prior_covariance = np.diag([tilt, tilt, 0.0, 0.0, 0.0, 0.0, speed, speed, speed])
+
+    height = np.zeros(n, bool)
+    if config.height.mode != "off":
+        arrivals = np.flatnonzero(rest[1:] & ~rest[:-1]) + 1
+        height[arrivals[arrivals > first]] = True
+    rows = Rows(
+        rest=jnp.asarray(rest),
+        velocity_variance=jnp.asarray(noise.rest_velocity_sd**2),
+        height=jnp.asarray(height),
+        height_variance=jnp.asarray(config.height.sd**2),
+    )
+    trial = Trial(
+        signal=signal,
+        period=np.full(n, T),
+        variance=variance,
+        sign=sign,
+        clean=(sign == 0) & ~recording.missing,
+        bound=np.repeat([limits.gyr_bound, limits.acc_bound], 3),
+        rows=rows,
+        prior=jax.tree.map(np.asarray, NavState(q_nb, velocity, jnp.zeros(3))),
+        prior_covariance=prior_covariance,
+        gravity=np.asarray(gravity),
+    )
+    return trial, offset
+
+
+def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:
+    smoothed, floor = _whole_trial(
+        trial.signal,
+        trial.period,
+        trial.variance,
+        trial.rows,
+        trial.prior,
+        trial.prior_covariance,
+        trial.gravity,
+        np.asarray(config.smoother.relinearisations),
+        config.height.mode == "nonnegative",
+    )
+    return jax.block_until_ready(smoothed), floor
+
+
+@eqx.filter_jit
+def _whole_trial(
+    signal, period, variance, rows, prior, prior_covariance, gravity, relinearisations, nonnegative: bool
+):
+    intervals = sample_intervals(signal, period, variance)
+    problem = (intervals, rows, prior, prior_covariance, gravity, relinearisations)
+    return smooth_nonnegative(*problem) if nonnegative else (smooth(*problem), None)

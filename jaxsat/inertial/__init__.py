@@ -1,0 +1,1 @@
+"""What physics says: rotations, strapdown integration, error model and smoother."""

@@ -1,0 +1,83 @@
+"""Linear-Gaussian atoms in covariance form: one scalar row, its adjoint, and nothing about sensors.
+
+Rows are taken one after the other, so no step factorises a matrix and no covariance is ever inverted: singular
+process noise and exactly known initial states are ordinary cases. The backward pass is the modified
+Bryson-Frazier smoother (Bierman 1973), here for scalar rows.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+class Row(eqx.Module):
+    """What one scalar row h·x = z + noise did to the estimate; zeros where the row was switched off."""
+
+    gain: Float[Array, "n"]
+    """K = P h / s."""
+    weighted: Float[Array, ""]
+    """Innovation over its variance, e / s."""
+    weight: Float[Array, ""]
+    """1 / s."""
+
+
+def update_row(
+    mean: Float[Array, "n"],
+    covariance: Float[Array, "n n"],
+    index: int,
+    residual: Float[Array, ""],
+    variance: Float[Array, ""],
+    active: Bool[Array, ""],
+) -> tuple[Float[Array, "n"], Float[Array, "n n"], Float[Array, ""], Row]:
+    """Condition on x[index] = residual + noise(variance); also returns the cost ½e²/s and the row's record."""
+    column = covariance[:, index]
+    s = jnp.where(active, column[index] + variance, 1.0)
+    weight = jnp.where(active, 1.0 / s, 0.0)
+    innovation = residual - mean[index]
+    gain = column * weight
+    cost = 0.5 * weight * innovation**2
+    row = Row(gain=gain, weighted=weight * innovation, weight=weight)
+    return mean + gain * innovation, covariance - jnp.outer(gain, column), cost, row
+
+
+def predict(
+    mean: Float[Array, "n"],
+    covariance: Float[Array, "n n"],
+    transition: Float[Array, "n n"],
+    offset: Float[Array, "n"],
+    noise: Float[Array, "n n"],
+) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+    """x' = Φ x + offset + w, cov(w) = noise."""
+    spread = transition @ covariance @ transition.T + noise
+    return transition @ mean + offset, 0.5 * (spread + spread.T)
+
+
+class Adjoint(eqx.Module):
+    """What all later rows say about a state: mean_s = mean − P·gradient, P_s = P − P·curvature·P."""
+
+    gradient: Float[Array, "n"]
+    curvature: Float[Array, "n n"]
+
+
+def adjoint_row(adjoint: Adjoint, index: int, row: Row) -> tuple[Adjoint, Float[Array, ""]]:
+    """Add one row to the adjoint; also returns its multiplier dJ*/dz."""
+    multiplier = row.gain @ adjoint.gradient + row.weighted
+    # CᵀΛC + h hᵀ/s with C = I − K hᵀ differs from Λ in row and column `index` only.
+    pulled = adjoint.curvature @ row.gain
+    curvature = adjoint.curvature.at[index, :].add(-pulled).at[:, index].add(-pulled)
+    curvature = curvature.at[index, index].add(row.gain @ pulled + row.weight)
+    return Adjoint(adjoint.gradient.at[index].add(-multiplier), curvature), multiplier
+
+
+def adjoint_transition(adjoint: Adjoint, transition: Float[Array, "n n"]) -> Adjoint:
+    """The adjoint at the start of a transition."""
+    curvature = transition.T @ adjoint.curvature @ transition
+    return Adjoint(transition.T @ adjoint.gradient, 0.5 * (curvature + curvature.T))
+
+
+def condition_on_future(
+    mean: Float[Array, "n"], covariance: Float[Array, "n n"], adjoint: Adjoint
+) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+    """Smoothed mean and covariance from the filtered ones."""
+    smoothed = covariance - covariance @ adjoint.curvature @ covariance
+    return mean - covariance @ adjoint.gradient, 0.5 * (smoothed + smoothed.T)

@@ -1,0 +1,1 @@
+"""Saturated samples: the segment objective, gap shapes and solvers."""

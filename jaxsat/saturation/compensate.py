@@ -1,0 +1,230 @@
+"""All segments of a recording, in parallel or one after the other (paper A, Section 5)."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsat.inertial.smoother import Rows, closed_loop
+from jaxsat.inertial.strapdown import NavState, sample_intervals
+from jaxsat.saturation.layout import Layout, Trial, bucket, gather, pad
+from jaxsat.saturation.methods import Compensation, SegmentFill, solve_segment
+from jaxsat.saturation.segment import Segment, arrivals
+from jaxsat.saturation.solvers import Status
+
+# Segments that are solved in one call: more share its overhead, but all wait for the slowest.
+_BATCH = 16
+
+Progress = Callable[[int, int], None]
+"""Called with (segments done, segments in all)."""
+
+
+class Options(eqx.Module):
+    """How the search runs; see `jaxsat.config.Saturation`."""
+
+    method: Compensation = eqx.field(static=True, default="direct")
+    free_peak_time: bool = eqx.field(static=True, default=False)
+    max_iterations: int = eqx.field(static=True, default=500)
+    tolerance: float | Float[Array, ""] = 1e-3
+
+
+class Fills(eqx.Module):
+    """The filled signal, and how each segment ended (one row a segment)."""
+
+    signal: Float[np.ndarray, "N 6"]
+    at_bound: Bool[np.ndarray, "N 6"]
+    """Values where the bound decided, not the data."""
+    status: Int[np.ndarray, "S"]
+    cost_before: Float[np.ndarray, "S"]
+    """f(0), with the departure of the last sweep."""
+    cost_after: Float[np.ndarray, "S"]
+    residual: Float[np.ndarray, "S"]
+    iterations: Int[np.ndarray, "S"]
+
+    @staticmethod
+    def nothing(trial: Trial, count: int) -> "Fills":
+        zeros = np.zeros(count)
+        return Fills(
+            signal=trial.signal.copy(),
+            at_bound=np.zeros(trial.signal.shape, bool),
+            status=np.full(count, int(Status.NOTHING_TO_DO)),
+            cost_before=zeros,
+            cost_after=zeros.copy(),
+            residual=zeros.copy(),
+            iterations=np.zeros(count, int),
+        )
+
+
+@eqx.filter_jit
+def _filter(signal, period, variance, rows: Rows, prior: NavState, covariance, gravity):
+    intervals = sample_intervals(signal, period, variance)
+    return closed_loop(intervals, rows, prior, covariance, gravity)
+
+
+@eqx.filter_jit
+def _arrivals(signal, period, variance, rows: Rows, segment_at, starts, count: int):
+    return arrivals(sample_intervals(signal, period, variance), rows, segment_at, starts, count)
+
+
+@eqx.filter_jit
+def _solve(batch: Segment, gravity, options: Options) -> SegmentFill:
+    return jax.vmap(
+        lambda segment: solve_segment(
+            segment,
+            gravity,
+            jnp.asarray(options.tolerance),
+            options.method,
+            options.free_peak_time,
+            options.max_iterations,
+        )
+    )(batch)
+
+
+def arrival_table(trial: Trial, layout: Layout) -> Float[np.ndarray, "S 10 10"]:
+    """Λ of every segment's arrival; zeros where no rest follows. Independent of δ: rests do not saturate."""
+    n, segments = len(trial.signal), layout.segments
+    segment_at, starts = np.full(n, -1), np.zeros(n, bool)
+    for index, (start, end) in enumerate(zip(segments.arrival, segments.rest_end, strict=True)):
+        segment_at[start:end] = index
+        starts[start : start + 1] = True
+    table = _arrivals(
+        trial.signal,
+        trial.period,
+        trial.variance,
+        trial.rows,
+        segment_at,
+        starts,
+        bucket(len(segments), 16),
+    )
+    table = np.asarray(table)[: len(segments)].copy()
+    table[segments.departure < 0] = 0.0
+    return table
+
+
+def _record(fills: Fills, trial: Trial, layout: Layout, index: int, found: SegmentFill) -> None:
+    """Write what was found for one segment into the arrays of the whole recording."""
+    mine = layout.values_of(index)
+    sample, channel = layout.sample[mine], layout.channel[mine]
+    count = len(sample)
+    fills.signal[sample, channel] = (
+        trial.signal[sample, channel] + trial.sign[sample, channel] * found.delta[:count]
+    )
+    fills.at_bound[sample, channel] = found.at_bound[:count]
+    fills.status[index] = found.solution.status
+    fills.cost_before[index], fills.cost_after[index] = found.cost_before, found.solution.value
+    fills.residual[index], fills.iterations[index] = found.solution.residual, found.solution.iterations
+
+
+def _solve_all(
+    segments: Sequence[tuple[int, Segment]], gravity, options: Options, done: Callable[[int], None]
+) -> list[tuple[int, SegmentFill]]:
+    """Solve segments of like shape together, a fixed number a call."""
+    groups = defaultdict(list)
+    for index, segment in segments:
+        groups[tuple(x.shape for x in jax.tree.leaves(segment))].append((index, segment))
+    found = []
+    for group in groups.values():
+        for first in range(0, len(group), _BATCH):
+            part = group[first : first + _BATCH]
+            # Two batch sizes only: each is a compilation of its own.
+            padded = part + [part[0]] * (_BATCH - len(part) if len(part) > 1 else 0)
+            batch = jax.tree.map(lambda *xs: np.stack(xs), *[segment for _, segment in padded])
+            result = jax.tree.map(np.asarray, _solve(batch, gravity, options))
+            for row, (index, _) in enumerate(part):
+                found.append((index, jax.tree.map(lambda x, row=row: x[row], result)))
+            done(len(part))
+    return found
+
+
+def compensate_parallel(
+    trial: Trial, layout: Layout, options: Options, sweeps: int = 2, progress: Progress | None = None
+) -> Fills:
+    """Solve all segments at once from one filter pass over the recording; then again with the filled signal.
+
+    In the first pass nothing is known of the saturated values but their bounds: they enter as measured, with
+    the second moment of a uniform 0 ≤ δ ≤ δ_b as additional variance, so that departures know how uncertain
+    their tilt is. Later passes filter the filled signal with sensor noise alone.
+    """
+    busy = np.unique(layout.gap_segment)
+    fills = Fills.nothing(trial, len(layout.segments))
+    table = arrival_table(trial, layout)
+    unknown = np.where(trial.sign != 0, trial.bound**2 / 3.0, 0.0)
+    count = 0
+
+    def done(more: int) -> None:
+        nonlocal count
+        count += more
+        if progress:
+            progress(count, sweeps * len(busy))
+
+    for sweep in range(sweeps):
+        variance = trial.variance + unknown if sweep == 0 else trial.variance
+        states, covariances = _filter(
+            fills.signal,
+            trial.period,
+            variance,
+            trial.rows,
+            trial.prior,
+            trial.prior_covariance,
+            trial.gravity,
+        )
+        states, covariances = jax.tree.map(np.asarray, (states, covariances))
+        work = []
+        for i in busy:
+            at = max(0, int(layout.segments.departure[i]))
+            state = NavState(states.q_nb[at], states.velocity[at], states.position[at])
+            work.append((i, gather(trial, layout, i, state, covariances[at], table[i])))
+        for index, found in _solve_all(work, trial.gravity, options, done):
+            _record(fills, trial, layout, index, found)
+    return fills
+
+
+def compensate_sequential(
+    trial: Trial, layout: Layout, options: Options, progress: Progress | None = None
+) -> Fills:
+    """The paper's order: each segment departs from the filtered end of the one before, filled already."""
+    segments = layout.segments
+    fills = Fills.nothing(trial, len(segments))
+    table = arrival_table(trial, layout)
+    busy = np.unique(layout.gap_segment)
+    state, covariance, at = trial.prior, trial.prior_covariance, 0
+    for count, index in enumerate(busy):
+        departure = max(0, int(segments.departure[index]))
+        state, covariance = _filter_to(trial, fills.signal, state, covariance, at, departure)
+        at = departure
+        segment = gather(trial, layout, index, state, covariance, table[index])
+        for _, found in _solve_all([(index, segment)], trial.gravity, options, lambda _: None):
+            _record(fills, trial, layout, index, found)
+        if progress:
+            progress(count + 1, len(busy))
+    return fills
+
+
+def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, stop: int):
+    """The filtered state at sample `stop`, from that at `start` (whose rows are used already, but at 0)."""
+    count = stop - start + 1
+    size = bucket(count, 64)
+
+    def span(x):
+        return pad(np.asarray(x)[start : stop + 1], size)
+
+    fresh = np.arange(size) >= (0 if start == 0 else 1)
+    rows = eqx.tree_at(
+        lambda r: (r.rest, r.height),
+        trial.rows,
+        (span(trial.rows.rest) & fresh, span(trial.rows.height) & fresh),
+    )
+    states, covariances = _filter(
+        span(signal),
+        span(trial.period),
+        span(trial.variance),
+        rows,
+        state,
+        covariance,
+        trial.gravity,
+    )
+    return jax.tree.map(lambda x: np.asarray(x[count - 1]), states), np.asarray(covariances[count - 1])

@@ -1,0 +1,117 @@
+"""Methods 1 and 2: what is searched, and the search of one segment (paper A, Section 4)."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsat.saturation.gap_shapes import peak, shape_value
+from jaxsat.saturation.segment import Segment, arrival_sensitivity, objective
+from jaxsat.saturation.solvers import Solution, Status, projected_gradient
+
+Compensation = Literal["direct", "triangle", "quadratic"]
+
+
+class Search(eqx.Module):
+    """The variables of a method, their bounds and start, and how they make δ."""
+
+    delta: Callable[[Float[Array, "p"]], Float[Array, "m"]] = eqx.field(static=True)
+    upper: Float[Array, "p"]
+    start: Float[Array, "p"]
+
+
+def search_space(method: Compensation, segment: Segment, free_peak_time: bool = False) -> Search:
+    """Method 1 (`direct`) searches every δ from 0; method 2 the height of each gap, from half of its range.
+
+    free_peak_time: method 2 also searches where in the gap the peak lies, instead of fixing it by Eq. 21.
+    """
+    if method == "direct":
+        return Search(lambda delta: delta, segment.bound, jnp.zeros_like(segment.bound))
+    edges = segment.edges
+    gap_bound = jnp.zeros_like(edges.rail).at[segment.gap].max(segment.bound)
+    top = peak(edges, edges.rail + gap_bound)
+    height_range = jnp.maximum(top.height - edges.rail, 0.0)
+    measured = segment.sign * segment.signal[segment.sample, segment.channel]
+    mine = jax.tree.map(lambda x: x[segment.gap], edges)
+    t = segment.sample.astype(segment.bound.dtype)
+    span = edges.h - edges.k
+
+    def delta(p):
+        height, time = edges.rail + p[: len(span)], top.time
+        if free_peak_time:
+            time = edges.k + span * p[len(span) :]
+        value = shape_value(method, t, mine, time[segment.gap], height[segment.gap])
+        return jnp.clip(value - measured, 0.0, segment.bound)
+
+    if not free_peak_time:
+        return Search(delta, height_range, 0.5 * height_range)
+    # A peak at an edge has no side to fall on: keep it a twentieth of the gap away.
+    fraction = jnp.clip((top.time - edges.k) / span, 0.05, 0.95)
+    return Search(
+        lambda p: delta(p.at[len(span) :].add(0.05)),
+        jnp.concatenate([height_range, jnp.full_like(span, 0.9)]),
+        jnp.concatenate([0.5 * height_range, fraction - 0.05]),
+    )
+
+
+class SegmentFill(eqx.Module):
+    """What was found for one segment."""
+
+    delta: Float[Array, "m"]
+    cost_before: Float[Array, ""]
+    """f(0)."""
+    solution: Solution
+    at_bound: Bool[Array, "m"]
+    """δ ends at its bound: the bound decided, not the data."""
+
+
+def solve_segment(
+    segment: Segment,
+    gravity: Float[Array, ""],
+    tolerance: Float[Array, ""],
+    method: Compensation,
+    free_peak_time: bool,
+    max_iterations: int,
+) -> SegmentFill:
+    """min over δ of f(δ), bounded one-sided (Eq. 18-20), by projected gradient through the inner minimum.
+
+    A segment that no rest follows (its arrival is zero) keeps δ = 0 and says so; a search that ends above
+    f(0) keeps δ = 0 too.
+    """
+    search = search_space(method, segment, free_peak_time)
+    rows, weight = arrival_sensitivity(search.delta(search.start), segment, gravity)
+    columns = jax.jacfwd(search.delta)(search.start).T @ rows
+    curvature = jnp.einsum("pi,ij,pj->p", columns, weight, columns)
+    # A variable that the data do not see is scaled by its range; one without range does not move.
+    scale = jnp.where(
+        search.upper > 0.0,
+        1.0 / jnp.sqrt(curvature + 1.0 / jnp.where(search.upper > 0.0, search.upper, 1.0) ** 2),
+        1.0,
+    )
+    zero = jnp.zeros_like(segment.bound)
+    before = objective(zero, segment, gravity)
+    solution = projected_gradient(
+        lambda p: objective(search.delta(p), segment, gravity),
+        search.start,
+        jnp.zeros_like(search.upper),
+        search.upper,
+        scale,
+        tolerance,
+        max_iterations,
+    )
+    blind = ~jnp.any(segment.arrival != 0.0)
+    keep = blind | (solution.value > before)
+    delta = jnp.where(keep, 0.0, search.delta(solution.x))
+    solution = eqx.tree_at(
+        lambda s: (s.status, s.value),
+        solution,
+        (
+            jnp.where(blind, Status.NO_ARRIVAL, solution.status),
+            jnp.where(keep, before, solution.value),
+        ),
+    )
+    at_bound = (segment.bound > 0.0) & (delta >= segment.bound * (1.0 - 1e-9))
+    return SegmentFill(delta=delta, cost_before=before, solution=solution, at_bound=at_bound)

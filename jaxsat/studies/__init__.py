@@ -1,0 +1,1 @@
+"""Many trials: simulation and scores."""
