@@ -1,1 +1,78 @@
-"""x"""
+"""Trajectories from inertial recordings that saturated.
+
+The public names are loaded when they are first used, so that importing the package costs nothing.
+"""
+
+import sys
+from importlib import import_module
+from importlib.metadata import version
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxsat.config import Config, load_config
+    from jaxsat.errors import InputError
+    from jaxsat.estimate import Estimate, Trajectory, estimate
+    from jaxsat.present.folder import write_results
+    from jaxsat.signals.readers import read
+    from jaxsat.signals.recording import Recording
+    from jaxsat.studies.metrics import position_rmse
+    from jaxsat.studies.motions import MOTIONS
+    from jaxsat.studies.simulate import Sensor, simulate
+
+_HOME = {
+    "Config": "jaxsat.config",
+    "Estimate": "jaxsat.estimate",
+    "InputError": "jaxsat.errors",
+    "MOTIONS": "jaxsat.studies.motions",
+    "Recording": "jaxsat.signals.recording",
+    "Sensor": "jaxsat.studies.simulate",
+    "Trajectory": "jaxsat.estimate",
+    "estimate": "jaxsat.estimate",
+    "load_config": "jaxsat.config",
+    "position_rmse": "jaxsat.studies.metrics",
+    "read": "jaxsat.signals.readers",
+    "simulate": "jaxsat.studies.simulate",
+    "write_results": "jaxsat.present.folder",
+}
+
+__all__ = [  # noqa: RUF022 (the order of _HOME)
+    "Config",
+    "Estimate",
+    "InputError",
+    "MOTIONS",
+    "Recording",
+    "Sensor",
+    "Trajectory",
+    "estimate",
+    "load_config",
+    "position_rmse",
+    "read",
+    "simulate",
+    "write_results",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return version("jaxsat")
+    if name not in _HOME:
+        raise AttributeError(f"module 'jaxsat' has no attribute '{name}'")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
+
+
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Importing the module `jaxsat.estimate` must not hide the function of that name.
+        if name == "estimate" and isinstance(value, ModuleType):
+            value = value.estimate
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

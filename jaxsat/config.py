@@ -37,7 +37,7 @@ class Rests(_Section):
     detector: Literal["shoe", "ared", "amvd", "mag"] = "shoe"
     threshold: Literal["auto"] | float = "auto"
     window: float = Field(default=0.04, gt=0, description="length of the detector's window (s)")
-    min_duration: float = Field(default=0.1, ge=0, description="shorter rests are dropped (s)")
+    min_duration: float = Field(default=0.05, ge=0, description="shorter rests are dropped (s)")
 
 
 class Rails(_Section):
@@ -60,9 +60,9 @@ class Saturation(_Section):
         default=False, description="search the peak time of a triangle or parabola too"
     )
     tolerance: float = Field(
-        default=1e-3, gt=0, description="largest accepted optimality residual (scaled, per variable)"
+        default=1e-2, gt=0, description="largest accepted optimality residual (scaled, per variable)"
     )
-    max_iterations: int = Field(default=500, ge=1)
+    max_iterations: int = Field(default=1000, ge=1)
 
 
 class Height(_Section):

@@ -14,7 +14,7 @@ from jaxsat.config import Config
 from jaxsat.errors import InputError
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
 from jaxsat.inertial.smoother import ActiveSet, Rows, Smoothed, smooth, smooth_nonnegative
-from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
+from jaxsat.inertial.strapdown import NavState, Samples, prefixes, sample_intervals
 from jaxsat.saturation.compensate import Fills, Options, compensate_parallel, compensate_sequential
 from jaxsat.saturation.layout import Layout, Trial
 from jaxsat.signals.checks import check
@@ -267,6 +267,5 @@ def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:
 def _whole_trial(
     signal, period, variance, rows, prior, prior_covariance, gravity, relinearisations, nonnegative: bool
 ):
-    intervals = sample_intervals(signal, period, variance)
-    problem = (intervals, rows, prior, prior_covariance, gravity, relinearisations)
+    problem = (Samples(signal, period, variance), rows, prior, prior_covariance, gravity, relinearisations)
     return smooth_nonnegative(*problem) if nonnegative else (smooth(*problem), None)

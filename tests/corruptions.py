@@ -59,11 +59,7 @@ def _file(name: str, content: bytes | None, *args: str) -> None:
             path.write_bytes(content)
         return path, [*args]
 
-    CORRUPTIONS[spoil_name(name)] = spoil
-
-
-def spoil_name(file_name: str) -> str:
-    return Path(file_name).stem
+    CORRUPTIONS[Path(name).stem] = spoil
 
 
 def _table(*args: str) -> Callable[[Callable[[pd.DataFrame], pd.DataFrame]], None]:

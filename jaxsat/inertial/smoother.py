@@ -12,13 +12,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial import kalman
 from jaxsat.inertial.strapdown import (
-    Interval,
     NavState,
+    Samples,
     add_error,
     advance,
     error_between,
     error_transition,
-    navigation_noise,
+    sample_intervals,
+    sample_noise,
 )
 
 HEIGHT, VELOCITY = 5, (6, 7, 8)
@@ -79,7 +80,7 @@ def _at(rows: Rows, timed: Rows) -> Rows:
 
 
 def closed_loop(
-    intervals: Interval,
+    samples: Samples,
     rows: Rows,
     prior: NavState,
     prior_covariance: Float[Array, "9 9"],
@@ -87,13 +88,13 @@ def closed_loop(
 ) -> tuple[NavState, Float[Array, "N1 9 9"]]:
     """Extended Kalman filter: strapdown that is corrected at each row.
 
-    intervals: one a sample, with noise. Returns the N+1 corrected states and their filtered covariances; they
+    Returns the N+1 corrected states and their filtered covariances; they
     are the reference of the smoother's first linearisation and the departure of each segment (Section 5).
     """
 
     def step(carry, inputs):
         state, covariance = carry
-        interval, timed = inputs
+        interval, sample, timed = inputs
         mean, covariance, _, _ = update_rows(
             jnp.zeros(9, covariance.dtype), covariance, state, _at(rows, timed)
         )
@@ -103,17 +104,18 @@ def closed_loop(
             covariance,
             error_transition(state.q_nb, interval),
             jnp.zeros_like(mean),
-            navigation_noise(state.q_nb, interval),
+            sample_noise(state.q_nb, sample.signal, sample.period, sample.variance),
         )
         return (advance(state, interval, gravity), predicted), (state, covariance)
 
-    last, corrected = jax.lax.scan(step, (prior, prior_covariance), (intervals, _row_axes(rows)))
+    intervals = sample_intervals(samples.signal, samples.period)
+    last, corrected = jax.lax.scan(step, (prior, prior_covariance), (intervals, samples, _row_axes(rows)))
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last)
 
 
 def smooth_about(
     reference: NavState,
-    intervals: Interval,
+    samples: Samples,
     rows: Rows,
     prior: NavState,
     prior_covariance: Float[Array, "9 9"],
@@ -124,20 +126,21 @@ def smooth_about(
     Where the reference does not follow the sensors (a corrected or already smoothed trajectory) its defects
     enter as known offsets, so repeating the call at its own result is Gauss-Newton on the nonlinear problem.
     """
+    intervals = sample_intervals(samples.signal, samples.period)
     start = jax.tree.map(lambda x: x[:-1], reference)
     end = jax.tree.map(lambda x: x[1:], reference)
     offsets = jax.vmap(lambda a, i, b: error_between(advance(a, i, gravity), b))(start, intervals, end)
 
     def forward(carry, inputs):
         mean, covariance, cost = carry
-        state, interval, offset, timed = inputs
+        state, interval, sample, offset, timed = inputs
         mean, covariance, extra, row = update_rows(mean, covariance, state, _at(rows, timed))
         predicted = kalman.predict(
             mean,
             covariance,
             error_transition(state.q_nb, interval),
             offset,
-            navigation_noise(state.q_nb, interval),
+            sample_noise(state.q_nb, sample.signal, sample.period, sample.variance),
         )
         return (*predicted, cost + extra), (mean, covariance, row)
 
@@ -153,7 +156,9 @@ def smooth_about(
     initial_error = error_between(prior, jax.tree.map(lambda x: x[0], reference))
     zero = jnp.zeros_like(gravity)
     (last_mean, last_covariance, cost), (mean, covariance, row) = jax.lax.scan(
-        forward, (initial_error, prior_covariance, zero), (start, intervals, offsets, _row_axes(rows))
+        forward,
+        (initial_error, prior_covariance, zero),
+        (start, intervals, samples, offsets, _row_axes(rows)),
     )
     nothing = kalman.Adjoint(jnp.zeros_like(last_mean), jnp.zeros_like(last_covariance))
     _, (error, smoothed, multiplier) = jax.lax.scan(
@@ -168,7 +173,7 @@ def smooth_about(
 
 
 def smooth(
-    intervals: Interval,
+    samples: Samples,
     rows: Rows,
     prior: NavState,
     prior_covariance: Float[Array, "9 9"],
@@ -176,12 +181,12 @@ def smooth(
     relinearisations: Int[Array, ""] | int = 1,
 ) -> Smoothed:
     """The standard smoother of a whole recording: closed-loop reference, then Gauss-Newton."""
-    reference, _ = closed_loop(intervals, rows, prior, prior_covariance, gravity)
-    first = smooth_about(reference, intervals, rows, prior, prior_covariance, gravity)
+    reference, _ = closed_loop(samples, rows, prior, prior_covariance, gravity)
+    first = smooth_about(reference, samples, rows, prior, prior_covariance, gravity)
     return jax.lax.fori_loop(
         0,
         relinearisations,
-        lambda _, s: smooth_about(s.state, intervals, rows, prior, prior_covariance, gravity),
+        lambda _, s: smooth_about(s.state, samples, rows, prior, prior_covariance, gravity),
         first,
     )
 
@@ -195,7 +200,7 @@ class ActiveSet(eqx.Module):
 
 
 def smooth_nonnegative(
-    intervals: Interval,
+    samples: Samples,
     rows: Rows,
     prior: NavState,
     prior_covariance: Float[Array, "9 9"],
@@ -215,7 +220,7 @@ def smooth_nonnegative(
 
     def solve(active):
         exact = Rows(rows.rest, rows.velocity_variance, active, zero)
-        smoothed = smooth(intervals, exact, prior, prior_covariance, gravity, relinearisations)
+        smoothed = smooth(samples, exact, prior, prior_covariance, gravity, relinearisations)
         low = smoothed.state.position[:-1, 2] < -tolerance
         wanted = candidates & jnp.where(active, smoothed.height_multiplier > 0.0, low)
         return smoothed, wanted

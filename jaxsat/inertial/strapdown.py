@@ -22,19 +22,43 @@ from jaxsat.inertial.rotations import (
 )
 
 
+class Moments(eqx.Module):
+    """Noise of an interval as sums over its samples, for noise that is the same on all axes of a sensor.
+
+    An error of sample j reaches the end of the interval through what follows it: V_j, W_j and τ_j, seen from
+    the interval's start. Isotropic noise needs no more than the second moments of those.
+    """
+
+    gyr: Float[Array, "*batch 7 7"]
+    """Σ c_j h_j h_jᵀ with h_j = [W_j; V_j; 1] and c_j the variance of a rate times T²."""
+    acc: Float[Array, "*batch 2 2"]
+    """Σ a_j s_j s_jᵀ with s_j = [½T + τ_j; 1] and a_j the variance of a specific force times T²."""
+
+
 class Interval(eqx.Module):
     """Motion over a stretch of time, seen from the body frame b₀ at its start, gravity not removed."""
 
     rotation: Float[Array, "*batch 4"]
     """Attitude change: the body frame at the end in that at the start (quaternion)."""
     velocity: Float[Array, "*batch 3"]
-    """∫ specific force dt in b₀ (m/s)."""
+    """V = ∫ specific force dt in b₀ (m/s)."""
     position: Float[Array, "*batch 3"]
-    """∬ specific force dt² in b₀ (m)."""
+    """W = ∬ specific force dt² in b₀ (m)."""
     duration: Float[Array, "*batch"]
-    """Length (s); zero makes the interval the identity of `compose`."""
-    noise: Float[Array, "*batch 9 9"] | None = None
-    """Covariance of the error [θ, r, v] gathered over the interval, in b₀; None where it is not asked for."""
+    """τ (s); zero makes the interval the identity of `compose`."""
+    noise: Moments | None = None
+    """None where it is not asked for."""
+
+
+class Samples(eqx.Module):
+    """What the sensors measured, sample by sample."""
+
+    signal: Float[Array, "N 6"]
+    """Angular rate and specific force (rad/s, m/s²)."""
+    period: Float[Array, "N"]
+    """How long each sample holds; zero pads (s)."""
+    variance: Float[Array, "N 6"]
+    """Noise variance of each value."""
 
 
 class NavState(eqx.Module):
@@ -46,38 +70,36 @@ class NavState(eqx.Module):
 
 
 def sample_interval(
-    gyr: Float[Array, "3"],
-    acc: Float[Array, "3"],
-    period: Float[Array, ""],
-    variance: Float[Array, "6"] | None = None,
+    signal: Float[Array, "6"], period: Float[Array, ""], variance: Float[Array, "2"] | None = None
 ) -> Interval:
-    """The interval of one sample that holds for one period.
+    """The interval of one sample (rad/s, m/s²) that holds for one period (s).
 
-    gyr (rad/s), acc (specific force, m/s²), period (s); variance: per-sample variances of the six channels,
-    with which the interval carries its noise: G diag(variance) Gᵀ, of rank 6 (Eq. 9, first order).
+    variance: of a gyroscope and an accelerometer axis; with it the interval carries its noise.
     """
-    half_turn = quat_exp(0.5 * period * gyr)
-    force = quat_rotate(half_turn, acc)
+    force = quat_rotate(quat_exp(0.5 * period * signal[:3]), signal[3:])
     noise = None
     if variance is not None:
-        R = quat_to_matrix(half_turn)
-        gyr_cov = (R * variance[None, :3]) @ R.T * period**2
-        acc_cov = (R * variance[None, 3:]) @ R.T * period**2
-        zero = jnp.zeros_like(R)
-        noise = jnp.block(
-            [
-                [gyr_cov, zero, zero],
-                [zero, 0.25 * period**2 * acc_cov, 0.5 * period * acc_cov],
-                [zero, 0.5 * period * acc_cov, acc_cov],
-            ]
+        s = jnp.stack([0.5 * period, jnp.ones_like(period)])
+        noise = Moments(
+            gyr=jnp.zeros((7, 7), signal.dtype).at[6, 6].set(variance[0] * period**2),
+            acc=variance[1] * period**2 * jnp.outer(s, s),
         )
     return Interval(
-        rotation=quat_exp(period * gyr),
+        rotation=quat_exp(period * signal[:3]),
         velocity=force * period,
         position=0.5 * force * period**2,
         duration=period,
         noise=noise,
     )
+
+
+def sample_intervals(
+    signal: Float[Array, "N 6"], period: Float[Array, "N"], variance: Float[Array, "N 2"] | None = None
+) -> Interval:
+    """`sample_interval` of each of N samples."""
+    if variance is None:
+        return jax.vmap(sample_interval)(signal, period)
+    return jax.vmap(sample_interval)(signal, period, variance)
 
 
 def error_transition(q_nb: Float[Array, "4"], interval: Interval) -> Float[Array, "9 9"]:
@@ -103,40 +125,147 @@ def rotate_noise(q: Float[Array, "4"], noise: Float[Array, "9 9"]) -> Float[Arra
     return jnp.einsum("ij,ajbk,lk->aibl", R, blocks, R).reshape(9, 9)
 
 
-def navigation_noise(q_nb: Float[Array, "4"], interval: Interval) -> Float[Array, "9 9"]:
-    """The interval's noise in the navigation frame, for an interval that carries it and starts at q_nb."""
-    if interval.noise is None:
-        raise ValueError("this interval carries no noise; give `variance` where it is made")
-    return rotate_noise(q_nb, interval.noise)
+def sample_noise(
+    q_nb: Float[Array, "4"],
+    signal: Float[Array, "6"],
+    period: Float[Array, ""],
+    variance: Float[Array, "6"],
+) -> Float[Array, "9 9"]:
+    """Covariance of [θ, r, v] in the navigation frame after one sample, each axis with its own variance.
+
+    First order in the paper's Eq. 9: a rate turns θ by T, a specific force moves v by T and r by ½T².
+    """
+    R = quat_to_matrix(quat_multiply(q_nb, quat_exp(0.5 * period * signal[:3]))) * period
+    turned = (R * variance[None, :3]) @ R.T
+    pushed = (R * variance[None, 3:]) @ R.T
+    zero, half = jnp.zeros_like(turned), 0.5 * period
+    return jnp.block(
+        [
+            [turned, zero, zero],
+            [zero, half**2 * pushed, half * pushed],
+            [zero, half * pushed, pushed],
+        ]
+    )
+
+
+def _followed_by(later: Interval) -> tuple[Float[Array, "7 7"], Float[Array, "2 2"]]:
+    """How h and s of `Moments` change when an interval, seen from the same start, follows."""
+    tau, eye = later.duration, jnp.eye(3, dtype=later.velocity.dtype)
+    one = jnp.ones((1, 1), eye.dtype)
+    zero, row = jnp.zeros_like(eye), jnp.zeros((1, 3), eye.dtype)
+    h = jnp.block(
+        [[eye, tau * eye, later.position[:, None]], [zero, eye, later.velocity[:, None]], [row, row, one]]
+    )
+    return h, jnp.array([[1.0, 0.0], [0.0, 1.0]], eye.dtype).at[0, 1].set(tau)
+
+
+def shift_moments(q: Float[Array, "4"], noise: Moments, later: Interval) -> Moments:
+    """Moments of an interval that starts at attitude q and is followed by `later`, seen from the frame of q's."""
+    R = quat_to_matrix(q)
+    turn = jax.scipy.linalg.block_diag(R, R, jnp.ones((1, 1), R.dtype))
+    h, s = _followed_by(later)
+    h = h @ turn
+    return Moments(gyr=h @ noise.gyr @ h.T, acc=s @ noise.acc @ s.T)
 
 
 def compose(first: Interval, second: Interval) -> Interval:
     """Two neighbouring intervals as one; associative."""
-    second_velocity = quat_rotate(first.rotation, second.velocity)
-    second_position = quat_rotate(first.rotation, second.position)
+    turned = Interval(
+        rotation=second.rotation,
+        velocity=quat_rotate(first.rotation, second.velocity),
+        position=quat_rotate(first.rotation, second.position),
+        duration=second.duration,
+    )
     noise = None
     if first.noise is not None and second.noise is not None:
-        transition = error_transition(first.rotation, second)
-        noise = transition @ first.noise @ transition.T + rotate_noise(first.rotation, second.noise)
+        identity = jnp.zeros_like(first.rotation).at[0].set(1.0)
+        nothing = jax.tree.map(jnp.zeros_like, turned)
+        noise = jax.tree.map(
+            jnp.add,
+            shift_moments(identity, first.noise, turned),
+            shift_moments(first.rotation, second.noise, nothing),
+        )
     return Interval(
         rotation=quat_multiply(first.rotation, second.rotation),
-        velocity=first.velocity + second_velocity,
-        position=first.position + first.velocity * second.duration + second_position,
+        velocity=first.velocity + turned.velocity,
+        position=first.position + first.velocity * second.duration + turned.position,
         duration=first.duration + second.duration,
         noise=noise,
     )
 
 
-def prefixes(intervals: Interval) -> Interval:
-    """For each of N intervals (leading axis), the composition of all up to and including it."""
+def between(first: Interval, second: Interval) -> Interval:
+    """What leads from one interval to a longer one with the same start: compose(first, result) = second."""
+    back, duration = quat_conjugate(first.rotation), second.duration - first.duration
+    return Interval(
+        rotation=quat_multiply(back, second.rotation),
+        velocity=quat_rotate(back, second.velocity - first.velocity),
+        position=quat_rotate(back, second.position - first.position - first.velocity * duration),
+        duration=duration,
+    )
 
-    def step(total, interval):
-        total = compose(total, interval)
+
+def noise_covariance(noise: Moments) -> Float[Array, "9 9"]:
+    """Covariance of [θ, r, v] at the end, in the frame of the start: Σ c b bᵀ + Σ a d dᵀ with
+    b = [I; −[W×]; −[V×]] and d = [0; sI; I]; [x×][y×]ᵀ = (x·y)I − y xᵀ."""
+    eye = jnp.eye(3, dtype=noise.gyr.dtype)
+    outer = noise.gyr[:6, :6].reshape(2, 3, 2, 3)
+    lift, speed = -skew(noise.gyr[:3, 6]), -skew(noise.gyr[3:6, 6])
+
+    def block(i, j):
+        return (jnp.trace(outer[i, :, j]) + noise.acc[i, j]) * eye - outer[j, :, i]
+
+    return jnp.block(
+        [
+            [noise.gyr[6, 6] * eye, lift.T, speed.T],
+            [lift, block(0, 0), block(0, 1)],
+            [speed, block(1, 0), block(1, 1)],
+        ]
+    )
+
+
+@jax.custom_jvp
+def rotation_prefixes(rotations: Float[Array, "N 4"]) -> Float[Array, "N 4"]:
+    """q₀⊗…⊗q_j for each j."""
+
+    def step(total, rotation):
+        total = quat_multiply(total, rotation)
         return total, total
 
-    nothing = jax.tree.map(lambda x: jnp.zeros_like(x[0]), intervals)
-    nothing = eqx.tree_at(lambda i: i.rotation, nothing, nothing.rotation.at[0].set(1.0))
-    return jax.lax.scan(step, nothing, intervals)[1]
+    identity = jnp.zeros_like(rotations[0]).at[0].set(1.0)
+    return jax.lax.scan(step, identity, rotations)[1]
+
+
+@rotation_prefixes.defjvp
+def _rotation_prefixes_jvp(primals, tangents):
+    # A right turn φ_i of factor i is a left turn R_i φ_i of every product from i on, so tangents add up.
+    (rotations,), (rates,) = primals, tangents
+    totals = rotation_prefixes(rotations)
+    turn = 2.0 * jax.vmap(quat_multiply)(jax.vmap(quat_conjugate)(rotations), rates)[:, 1:]
+    turned = jnp.cumsum(jax.vmap(quat_rotate)(totals, turn), axis=0)
+    left = jnp.concatenate([jnp.zeros_like(turned[:, :1]), 0.5 * turned], axis=1)
+    return totals, jax.vmap(quat_multiply)(left, totals)
+
+
+def prefixes(intervals: Interval) -> Interval:
+    """For each of N intervals (leading axis), the composition of all up to and including it, without noise.
+
+    Attitude is a running product, velocity and position are running sums.
+    """
+
+    def before(x):
+        return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
+
+    rotation = rotation_prefixes(intervals.rotation)
+    start = before(rotation).at[0, 0].set(1.0)
+    velocity = jnp.cumsum(jax.vmap(quat_rotate)(start, intervals.velocity), axis=0)
+    step = jax.vmap(quat_rotate)(start, intervals.position)
+    return Interval(
+        rotation=rotation,
+        velocity=velocity,
+        position=jnp.cumsum(step + before(velocity) * intervals.duration[:, None], axis=0),
+        duration=jnp.cumsum(intervals.duration),
+    )
 
 
 def advance(state: NavState, interval: Interval, gravity: Float[Array, ""]) -> NavState:
@@ -153,54 +282,6 @@ def advance(state: NavState, interval: Interval, gravity: Float[Array, ""]) -> N
             - 0.5 * fall * tau**2
         ),
     )
-
-
-def sample_intervals(
-    signal: Float[Array, "N 6"],
-    period: Float[Array, "N"],
-    variance: Float[Array, "N 6"] | None = None,
-) -> Interval:
-    """One interval a sample, from the six channels (rad/s, m/s²); a period of zero pads."""
-    if variance is None:
-        return jax.vmap(lambda s, T: sample_interval(s[:3], s[3:], T))(signal, period)
-    return jax.vmap(lambda s, T, var: sample_interval(s[:3], s[3:], T, var))(signal, period, variance)
-
-
-def input_effects(
-    signal: Float[Array, "N 6"], period: Float[Array, "N"]
-) -> tuple[Interval, Float[Array, "N 9 6"]]:
-    """What N samples add up to, and how an error of each input shows at their end.
-
-    Returns the interval without noise, and G: the error [θ, r, v] at the end, in the body frame at the start,
-    per unit error of each channel of each sample. With the parts V_rem, W_rem, τ_rem that follow sample j
-    its columns are T[I; −[W_rem×]; −[V_rem×]]R_j for the gyroscope and T[0; ½T + τ_rem; I]R_j for the
-    accelerometer (R_j: attitude in mid-sample), all of them differences of prefix sums.
-    """
-    upto = prefixes(sample_intervals(signal, period))
-    total = jax.tree.map(lambda x: x[-1], upto)
-
-    def effect(rotation, velocity, position, duration, gyr, T):
-        # The end attitude turned back by half a sample is the attitude in its middle.
-        R = quat_to_matrix(quat_multiply(rotation, quat_exp(-0.5 * T * gyr)))
-        remaining = total.duration - duration
-        velocity_left = total.velocity - velocity
-        position_left = total.position - position - velocity * remaining
-        turn = jnp.concatenate([R, -skew(position_left) @ R, -skew(velocity_left) @ R])
-        push = jnp.concatenate([jnp.zeros_like(R), (0.5 * T + remaining) * R, R])
-        return T * jnp.concatenate([turn, push], axis=1)
-
-    return total, jax.vmap(effect)(
-        upto.rotation, upto.velocity, upto.position, upto.duration, signal[:, :3], period
-    )
-
-
-def collapse(
-    signal: Float[Array, "N 6"], period: Float[Array, "N"], variance: Float[Array, "N 6"]
-) -> Interval:
-    """N samples as one interval with its noise: equal to composing them one by one, at the cost of prefix sums."""
-    total, effects = input_effects(signal, period)
-    spread = jnp.moveaxis(effects * jnp.sqrt(variance)[:, None, :], 1, 0).reshape(9, -1)
-    return eqx.tree_at(lambda i: i.noise, total, spread @ spread.T, is_leaf=lambda x: x is None)
 
 
 def strapdown(

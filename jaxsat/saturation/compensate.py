@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.smoother import Rows, closed_loop
-from jaxsat.inertial.strapdown import NavState, sample_intervals
+from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.layout import Layout, Trial, bucket, gather, pad
 from jaxsat.saturation.methods import Compensation, SegmentFill, solve_segment
 from jaxsat.saturation.segment import Segment, arrivals
@@ -61,13 +61,12 @@ class Fills(eqx.Module):
 
 @eqx.filter_jit
 def _filter(signal, period, variance, rows: Rows, prior: NavState, covariance, gravity):
-    intervals = sample_intervals(signal, period, variance)
-    return closed_loop(intervals, rows, prior, covariance, gravity)
+    return closed_loop(Samples(signal, period, variance), rows, prior, covariance, gravity)
 
 
 @eqx.filter_jit
 def _arrivals(signal, period, variance, rows: Rows, segment_at, starts, count: int):
-    return arrivals(sample_intervals(signal, period, variance), rows, segment_at, starts, count)
+    return arrivals(Samples(signal, period, variance), rows, segment_at, starts, count)
 
 
 @eqx.filter_jit

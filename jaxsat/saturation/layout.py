@@ -125,6 +125,7 @@ def gather(
     gaps, values = layout.gaps_of(index), layout.values_of(index)
     channel, sample = layout.channel[values], layout.sample[values]
     count = gaps.stop - gaps.start
+    cut, element = np.unique(sample - start, return_inverse=True)
     m, g = bucket(len(sample), 16), bucket(count, 4)
     edges = np.concatenate([layout.edges[gaps], np.repeat(_NO_GAP, g - count, axis=0)])
     edges[:count, :2] -= start
@@ -133,8 +134,10 @@ def gather(
     arrays = {
         "signal": pad(trial.signal[start:stop], n),
         "period": pad(trial.period[start:stop], n),
-        "variance": pad(trial.variance[start:stop], n),
-        "sample": pad(sample - start, m),
+        # One variance for the three axes of a sensor, on the safe side where they differ.
+        "variance": pad(trial.variance[start:stop].reshape(-1, 2, 3).max(axis=2), n),
+        "cut": np.concatenate([cut, np.full(m - len(cut), n)]),
+        "element": pad(element, m),
         "channel": pad(channel, m),
         "sign": pad(trial.sign[sample, channel].astype(float), m),
         "bound": pad(trial.bound[channel], m),

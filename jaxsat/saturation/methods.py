@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsat.saturation.gap_shapes import peak, shape_value
-from jaxsat.saturation.segment import Segment, arrival_sensitivity, objective
+from jaxsat.saturation.segment import Segment, arrival_sensitivity, condense, objective
 from jaxsat.saturation.solvers import Solution, Status, projected_gradient
 
 Compensation = Literal["direct", "triangle", "quadratic"]
@@ -34,9 +34,10 @@ def search_space(method: Compensation, segment: Segment, free_peak_time: bool = 
     gap_bound = jnp.zeros_like(edges.rail).at[segment.gap].max(segment.bound)
     top = peak(edges, edges.rail + gap_bound)
     height_range = jnp.maximum(top.height - edges.rail, 0.0)
-    measured = segment.sign * segment.signal[segment.sample, segment.channel]
+    sample = segment.cut[segment.element]
+    measured = segment.sign * segment.signal[sample, segment.channel]
     mine = jax.tree.map(lambda x: x[segment.gap], edges)
-    t = segment.sample.astype(segment.bound.dtype)
+    t = sample.astype(segment.bound.dtype)
     span = edges.h - edges.k
 
     def delta(p):
@@ -82,7 +83,8 @@ def solve_segment(
     f(0) keeps δ = 0 too.
     """
     search = search_space(method, segment, free_peak_time)
-    rows, weight = arrival_sensitivity(search.delta(search.start), segment, gravity)
+    condensed = condense(segment)
+    rows, weight = arrival_sensitivity(search.delta(search.start), condensed, gravity)
     columns = jax.jacfwd(search.delta)(search.start).T @ rows
     curvature = jnp.einsum("pi,ij,pj->p", columns, weight, columns)
     # A variable that the data do not see is scaled by its range; one without range does not move.
@@ -92,9 +94,9 @@ def solve_segment(
         1.0,
     )
     zero = jnp.zeros_like(segment.bound)
-    before = objective(zero, segment, gravity)
+    before = objective(zero, condensed, gravity)
     solution = projected_gradient(
-        lambda p: objective(search.delta(p), segment, gravity),
+        lambda p: objective(search.delta(p), condensed, gravity),
         search.start,
         jnp.zeros_like(search.upper),
         search.upper,

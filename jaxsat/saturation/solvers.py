@@ -42,7 +42,7 @@ class Solution(eqx.Module):
 
 
 # Momentum is dropped after so many steps: acceleration without restarts oscillates about the minimiser.
-_STEPS_PER_ROUND = 40
+_STEPS_PER_ROUND = 120
 
 
 def projected_gradient(

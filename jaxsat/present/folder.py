@@ -1,0 +1,92 @@
+"""Result folders: whole or not at all."""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import pandas as pd
+
+from jaxsat.errors import InputError
+from jaxsat.estimate import Estimate
+from jaxsat.present.report import Track, render_report
+from jaxsat.present.summary import summarise
+from jaxsat.present.tables import gaps_table, signals_table, trajectory_table
+
+_TABLES = {"trajectory": trajectory_table, "signals": signals_table, "gaps": gaps_table}
+_OURS = {
+    "summary.json",
+    "report.html",
+    *(f"{name}.{kind}" for name in _TABLES for kind in ("csv", "parquet")),
+}
+
+
+def check_folder(folder: Path) -> None:
+    """Raise `InputError` where results cannot go: only a new, an empty or a former result folder is written."""
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise InputError(f"{folder}: not a folder; choose another name for the results.")
+    if folder.is_dir():
+        present = {entry.name for entry in folder.iterdir()}
+        if present and not ("summary.json" in present and present <= _OURS):
+            other = min(present - _OURS, default="other files")
+            raise InputError(f"{folder}: holds files that are no results ({other}); choose another folder.")
+    parent = folder.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not (parent.is_dir() and os.access(parent, os.W_OK)):
+        raise InputError(f"{folder}: {parent} is not a folder that can be written; choose another place.")
+
+
+def write_results(
+    estimate: Estimate,
+    folder: str | Path,
+    *,
+    csv: bool = False,
+    source: Path | None = None,
+    beside: Mapping[str, Track] | None = None,
+    scores: pd.DataFrame | None = None,
+) -> Path:
+    """Write the documented files of an estimate; returns the path of its report.
+
+    `source` is the file that the recording came from; `beside` are other tracks to draw, and `scores` a table
+    to show, in the report. A former result folder is replaced; raises `InputError` as `check_folder` does.
+    """
+    folder = Path(folder)
+    with _replaced(folder) as new:
+        for name, make in _TABLES.items():
+            table = make(estimate)
+            if csv:
+                table.to_csv(new / f"{name}.csv", index=False)
+            else:
+                table.to_parquet(new / f"{name}.parquet", index=False)
+        summary = summarise(estimate, source)
+        (new / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n")
+        (new / "report.html").write_text(render_report(estimate, summary, beside or {}, scores), "utf-8")
+    return folder / "report.html"
+
+
+@contextmanager
+def _replaced(folder: Path) -> Iterator[Path]:
+    """A new folder that takes the place of `folder` when the block ends well, and vanishes otherwise."""
+    check_folder(folder)
+    folder = folder.absolute()
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        # Beside the target, so that renaming stays within one file system.
+        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another place.") from None
+    try:
+        new, old = work / "new", work / "old"
+        new.mkdir()
+        yield new
+        if folder.exists():
+            os.rename(folder, old)
+        os.rename(new, folder)
+    finally:
+        if (work / "old").exists() and not folder.exists():
+            os.rename(work / "old", folder)
+        shutil.rmtree(work)

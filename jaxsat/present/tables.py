@@ -1,0 +1,107 @@
+"""An estimate as tables: one column a quantity, SI units, the names of the documented files."""
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from jaxsat.estimate import Estimate
+from jaxsat.saturation.solvers import Status
+from jaxsat.signals.recording import CHANNELS
+
+AXES = ("x", "y", "z")
+
+
+def _axes(prefix: str, suffix: str = "") -> list[str]:
+    return [f"{prefix}_{axis}{suffix}" for axis in AXES]
+
+
+def _frame(columns: dict[tuple[str, ...], np.ndarray]) -> pd.DataFrame:
+    """Blocks of columns side by side, each keeping its type."""
+    data = {}
+    for names, block in columns.items():
+        data.update(zip(names, block.reshape(len(block), -1).T, strict=True))
+    return pd.DataFrame(data)
+
+
+def trajectory_table(estimate: Estimate) -> pd.DataFrame:
+    """One row a sample: the state at its start, its sd, and where in the recording it is.
+
+    Columns: `time` (s), `q_w…q_z` (body to navigation frame), `pos_*` (m), `vel_*` (m/s), their sd with the
+    attitude's as `att_*_sd` (rad, navigation frame), `rest`, and `segment`, the number of the stretch of
+    motion, -1 at rest.
+    """
+    trajectory = estimate.trajectory
+    sd = np.sqrt(np.diagonal(trajectory.covariance, axis1=1, axis2=2))
+    columns = {
+        ("time",): trajectory.time,
+        ("q_w", "q_x", "q_y", "q_z"): trajectory.q_nb,
+        tuple(_axes("pos")): trajectory.position,
+        tuple(_axes("vel")): trajectory.velocity,
+        (*_axes("att", "_sd"), *_axes("pos", "_sd"), *_axes("vel", "_sd")): sd,
+        ("rest",): estimate.rest,
+        ("segment",): _segment_at(estimate, np.arange(len(trajectory.time))),
+    }
+    return _frame(columns)
+
+
+def signals_table(estimate: Estimate) -> pd.DataFrame:
+    """One row a sample: `time`, the filled channels, the measured ones as `raw_*`, where they saturate as
+    `sat_*`, and the sd of the filled ones as `*_sd` (rad/s, m/s²).
+    """
+    columns = {
+        ("time",): estimate.recording.time,
+        CHANNELS: estimate.filled,
+        tuple(f"raw_{channel}" for channel in CHANNELS): estimate.recording.signal,
+        tuple(f"sat_{channel}" for channel in CHANNELS): estimate.saturated,
+        tuple(f"{channel}_sd" for channel in CHANNELS): estimate.signal_sd,
+    }
+    return _frame(columns)
+
+
+def gaps_table(estimate: Estimate) -> pd.DataFrame:
+    """One row a gap, in the order of time.
+
+    Columns: `channel`, `start` and `end` (s, [start, end)), `rail` (the limit, signed; where the device flagged
+    the gap and no limit is known, the extreme measured value), `peak` (extreme filled value, signed), `impulse`
+    (time integral of what was added, rad or m/s), `status` (how the search of the gap's segment ended:
+    `converged`, `max_iterations`, `no_arrival` where no rest follows, or `ignored` by method standard).
+    `peak_sd`, `impulse_sd` and `identified` are empty: methods standard, direct, triangle and quadratic find one
+    best signal, not a distribution, so they cannot say how well a gap is known.
+    """
+    gaps, recording = estimate.gaps, estimate.recording
+    period, added = recording.period, estimate.filled - recording.signal
+    limits = np.stack([estimate.rails.low, estimate.rails.high])[(gaps.sign > 0).astype(int), gaps.channel]
+    spans = list(zip(gaps.channel, gaps.start, gaps.end, strict=True))
+    measured = np.array([_extreme(recording.signal[i:j, c]) for c, i, j in spans])
+    unknown = pd.array([pd.NA] * len(gaps), dtype="Float64")
+    table = pd.DataFrame(
+        {
+            "channel": pd.array(np.array(CHANNELS)[gaps.channel], dtype="string"),
+            "start": recording.time[gaps.start],
+            "end": recording.time[gaps.start] + period * (gaps.end - gaps.start),
+            "rail": np.where(np.isfinite(limits), limits, measured),
+            "peak": np.array([_extreme(estimate.filled[i:j, c]) for c, i, j in spans], float),
+            "peak_sd": unknown,
+            "impulse": np.array([added[i:j, c].sum() * period for c, i, j in spans], float),
+            "impulse_sd": unknown,
+            "identified": pd.array([pd.NA] * len(gaps), dtype="boolean"),
+            "status": pd.array(_status_words(estimate)[_segment_at(estimate, gaps.start)], dtype="string"),
+        }
+    )
+    return table.sort_values(["start", "channel"], ignore_index=True)
+
+
+def _extreme(values: Float[np.ndarray, "n"]) -> float:
+    return float(values[np.argmax(np.abs(values))])
+
+
+def _segment_at(estimate: Estimate, sample: np.ndarray) -> np.ndarray:
+    """Number of the segment that a sample lies in, -1 at rest."""
+    segment = np.searchsorted(estimate.segments.arrival, sample, side="right")
+    return np.where(estimate.rest[sample], -1, segment)
+
+
+def _status_words(estimate: Estimate) -> np.ndarray:
+    if estimate.config.method == "standard":
+        return np.full(len(estimate.segments), "ignored", dtype=object)
+    return np.array([Status(code).name.lower() for code in estimate.fills.status], dtype=object)

@@ -1,0 +1,101 @@
+"""Short plain text for a terminal."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsat.estimate import Estimate
+from jaxsat.saturation.solvers import Status
+from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
+
+
+def columns(rows: Sequence[Sequence[str]]) -> str:
+    """Rows as aligned text: the first column to the left, the others to the right."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [
+            row[0].ljust(widths[0]),
+            *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)),
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def plural(count: int, noun: str) -> str:
+    """'1 gap', '2 gaps'."""
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
+def inspection_text(found: Mapping[str, Any]) -> str:
+    """What `jaxsat inspect` prints."""
+    rests, force = found["rests"], found["specific_force_at_rest"]
+    lines = [
+        f"{found['name']}: {found['samples']} samples at {found['rate']:.6g} Hz, {found['duration']:.2f} s",
+        f"missing values: {found['missing_values']}",
+        f"rests: {rests['count']} ({rests['source']}), {rests['share']:.0%} of the time"
+        + (f"; first {rests['first'][0]:.2f} to {rests['first'][1]:.2f} s" if rests["first"] else ""),
+        "specific force at rest: "
+        + (f"{force:.3f} m/s²" if force is not None else "unknown, there is no rest"),
+        "",
+    ]
+    rows = [["channel", "lowest", "highest", "", "lower rail", "upper rail", "saturated", "gaps", "longest"]]
+    for channel, sides in found["rails"].items():
+        # Data sheets speak of °/s and g: rails are shown in both.
+        unit, other = ("rad/s", "deg/s") if channel.startswith("gyr") else ("m/s²", "g")
+        scale = ANGULAR_RATE["deg/s"] if other == "deg/s" else SPECIFIC_FORCE["g"]
+        rails = [
+            "-" if side["rail"] is None else f"{side['rail']:.4g} ({side['rail'] / scale:.4g} {other})"
+            for side in (sides["low"], sides["high"])
+        ]
+        gaps = sum(side["gaps"] for side in sides.values())
+        longest = max(side["longest_gap"] for side in sides.values())
+        rows.append(
+            [
+                channel,
+                f"{found['lowest'][channel]:.4g}",
+                f"{found['highest'][channel]:.4g}",
+                unit,
+                *rails,
+                str(found["saturated"][channel]),
+                str(gaps),
+                str(longest),
+            ]
+        )
+    lines.append(columns(rows))
+    lines += [f"warning: {warning}" for warning in found["warnings"]]
+    return "\n".join(lines)
+
+
+def estimate_text(estimate: Estimate, report: Path) -> str:
+    """What `jaxsat estimate` prints."""
+    recording, position = estimate.recording, estimate.trajectory.position
+    status = estimate.fills.status
+    searched = status != Status.NOTHING_TO_DO
+    rows = [
+        ["recording", f"{recording.name}, {len(recording)} samples at {1 / recording.period:.4g} Hz"],
+        ["method", estimate.config.method],
+        [
+            "saturated",
+            f"{plural(int(estimate.saturated.sum()), 'value')} in {plural(len(estimate.gaps), 'gap')}",
+        ],
+        [
+            "rests",
+            f"{estimate.rest.mean():.0%} of the time, with {plural(len(estimate.segments), 'segment')} of motion",
+        ],
+    ]
+    if searched.any():
+        settled = int((status == Status.CONVERGED).sum())
+        rows.append(["searches", f"{settled} of {int(searched.sum())} settled on a minimum"])
+    cost = f"{float(estimate.cost):.4g}"
+    if estimate.config.method != "standard":
+        cost += f" (was {float(estimate.cost_standard):.4g} with saturation ignored)"
+    moved = np.linalg.norm(position[-1, :2] - position[0, :2])
+    rows += [
+        ["misfit J*", cost],
+        ["start to end", f"{moved:.3f} m horizontally, {position[-1, 2] - position[0, 2]:+.3f} m in height"],
+        ["report", str(report)],
+    ]
+    return "\n".join(f"{label:<14}{text}" for label, text in rows)
