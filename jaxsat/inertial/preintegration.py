@@ -6,7 +6,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial.rotations import quat_exp, quat_multiply, quat_rotate
-from jaxsat.inertial.strapdown import Interval, Moments, between, prefixes, sample_intervals, shift_moments
+from jaxsat.inertial.strapdown import (
+    Interval,
+    Moments,
+    between,
+    compose,
+    prefixes,
+    sample_intervals,
+    shift_moments,
+)
 
 
 def remainders(upto: Interval) -> Interval:
@@ -24,7 +32,7 @@ def remainders(upto: Interval) -> Interval:
     )
 
 
-def _sources(after: Interval, period: Float[Array, "N"], variance: Float[Array, "N 2"]):
+def noise_sources(after: Interval, period: Float[Array, "N"], variance: Float[Array, "N 2"]):
     """√c h (N, 7) and √a s (N, 2) of `Moments` for samples that `after` follows."""
     root = jnp.sqrt(variance) * period[:, None]
     one = jnp.ones_like(period)[:, None]
@@ -38,7 +46,7 @@ def collapse(
 ) -> Interval:
     """N samples as one interval with its noise."""
     upto = prefixes(sample_intervals(signal, period))
-    h, s = _sources(remainders(upto), period, variance)
+    h, s = noise_sources(remainders(upto), period, variance)
     total = jax.tree.map(lambda x: x[-1], upto)
     return eqx.tree_at(
         lambda i: i.noise, total, Moments(gyr=h.T @ h, acc=s.T @ s), is_leaf=lambda x: x is None
@@ -50,7 +58,7 @@ def stretches(
     period: Float[Array, "N"],
     variance: Float[Array, "N 2"],
     cut: Int[Array, "M"],
-) -> Interval:
+) -> tuple[Interval, Moments]:
     """The M+1 stretches between the samples `cut` (ascending; N pads), which belong to none of them."""
     count = len(period)
     upto = prefixes(sample_intervals(signal, period))
@@ -77,19 +85,40 @@ def stretches(
         position=whole.position - until.position - until.velocity * left[:, None],
         duration=left,
     )
-    h, s = _sources(after, period, variance)
+    h, s = noise_sources(after, period, variance)
     weight = one_hot.astype(h.dtype)
     noise = Moments(
         gyr=jnp.einsum("km,ki,kj->mij", weight, h, h), acc=jnp.einsum("km,ki,kj->mij", weight, s, s)
     )
-    return eqx.tree_at(lambda i: i.noise, inner, noise, is_leaf=lambda x: x is None)
+    return inner, noise
 
 
-def gather_noise(noise: Moments, upto: Interval) -> Moments:
-    """The noise of neighbouring intervals as one; upto: the prefixes of those intervals."""
+def alternate(
+    gaps: Interval,
+    noise: Moments,
+    signal: Float[Array, "M 6"],
+    period: Float[Array, "M"],
+    variance: Float[Array, "M 2"],
+) -> tuple[Interval, Moments]:
+    """M stretches, each followed by a sample: prefixes of these pairs, and the noise of all of them together."""
+    samples = sample_intervals(signal, period)
+    upto = prefixes(jax.vmap(compose)(gaps, samples))
+    after = remainders(upto)
+    h, s = noise_sources(after, period, variance)
+    # A stretch starts where the pair before it ends, and its sample follows before the rest does.
     start = jnp.concatenate([jnp.zeros_like(upto.rotation[:1]).at[0, 0].set(1.0), upto.rotation[:-1]])
-    shifted = jax.vmap(shift_moments)(start, noise, remainders(upto))
-    return jax.tree.map(lambda x: jnp.sum(x, axis=0), shifted)
+    turned = jax.vmap(quat_rotate)(jax.vmap(quat_multiply)(start, gaps.rotation), samples.velocity)
+    moved = jax.vmap(quat_rotate)(jax.vmap(quat_multiply)(start, gaps.rotation), samples.position)
+    later = Interval(
+        rotation=after.rotation,
+        velocity=after.velocity + turned,
+        position=after.position + turned * after.duration[:, None] + moved,
+        duration=after.duration + period,
+    )
+    shifted = jax.vmap(shift_moments)(start, noise, later)
+    return upto, Moments(
+        gyr=jnp.sum(shifted.gyr, axis=0) + h.T @ h, acc=jnp.sum(shifted.acc, axis=0) + s.T @ s
+    )
 
 
 def input_effects(

@@ -148,24 +148,21 @@ def sample_noise(
     )
 
 
-def _followed_by(later: Interval) -> tuple[Float[Array, "7 7"], Float[Array, "2 2"]]:
-    """How h and s of `Moments` change when an interval, seen from the same start, follows."""
-    tau, eye = later.duration, jnp.eye(3, dtype=later.velocity.dtype)
-    one = jnp.ones((1, 1), eye.dtype)
-    zero, row = jnp.zeros_like(eye), jnp.zeros((1, 3), eye.dtype)
-    h = jnp.block(
-        [[eye, tau * eye, later.position[:, None]], [zero, eye, later.velocity[:, None]], [row, row, one]]
-    )
-    return h, jnp.array([[1.0, 0.0], [0.0, 1.0]], eye.dtype).at[0, 1].set(tau)
+def _congruence(x: Float[Array, "n n"], g: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """x g xᵀ as sums, which fuse: many products of small matrices would be a library call each."""
+    xg = jnp.sum(x[:, :, None] * g[None, :, :], axis=1)
+    return jnp.sum(xg[:, None, :] * x[None, :, :], axis=2)
 
 
 def shift_moments(q: Float[Array, "4"], noise: Moments, later: Interval) -> Moments:
     """Moments of an interval that starts at attitude q and is followed by `later`, seen from the frame of q's."""
-    R = quat_to_matrix(q)
-    turn = jax.scipy.linalg.block_diag(R, R, jnp.ones((1, 1), R.dtype))
-    h, s = _followed_by(later)
-    h = h @ turn
-    return Moments(gyr=h @ noise.gyr @ h.T, acc=s @ noise.acc @ s.T)
+    tau, R = later.duration, quat_to_matrix(q)
+    zero, row, one = jnp.zeros_like(R), jnp.zeros((1, 3), R.dtype), jnp.ones((1, 1), R.dtype)
+    h = jnp.block(
+        [[R, tau * R, later.position[:, None]], [zero, R, later.velocity[:, None]], [row, row, one]]
+    )
+    s = jnp.eye(2, dtype=R.dtype).at[0, 1].set(tau)
+    return Moments(gyr=_congruence(h, noise.gyr), acc=_congruence(s, noise.acc))
 
 
 def compose(first: Interval, second: Interval) -> Interval:

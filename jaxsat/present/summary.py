@@ -17,7 +17,7 @@ from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_
 from jaxsat.signals.recording import CHANNELS, Recording
 from jaxsat.signals.rests import find_rests, runs
 
-_SENSORS = {"gyr": ("gyroscope", slice(0, 3)), "acc": ("accelerometer", slice(3, 6))}
+_SENSORS = {"gyr": ("gyroscope", "rad/s", slice(0, 3)), "acc": ("accelerometer", "m/s²", slice(3, 6))}
 
 
 def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
@@ -69,12 +69,12 @@ def warnings_of(estimate: Estimate) -> list[str]:
     """What a reader of the results must know, one sentence each."""
     fills, config = estimate.fills, estimate.config
     found = [*estimate.warnings]
-    for sensor, (name, channels) in _SENSORS.items():
+    for sensor, (name, unit, channels) in _SENSORS.items():
         given = getattr(config.rails, sensor)
         if isinstance(given, float) and not estimate.saturated[:, channels].any():
             highest = np.abs(estimate.recording.signal[:, channels]).max()
             found.append(
-                f"no sample reaches the given {name} rail of {given:g} (highest: {highest:.4g}, both SI); "
+                f"no sample reaches the given {name} rail of {given:g} {unit} (highest: {highest:.4g}); "
                 f"check its unit, which on the command line is that of --{sensor}-unit."
             )
     searched = int((fills.status != Status.NOTHING_TO_DO).sum())
@@ -90,11 +90,11 @@ def warnings_of(estimate: Estimate) -> list[str]:
         found.append(
             f"no rest follows the motion that begins at {first:.2f} s: its saturated values stay as measured."
         )
-    for sensor, (name, channels) in _SENSORS.items():
+    for sensor, (name, unit, channels) in _SENSORS.items():
         count, bound = int(fills.at_bound[:, channels].sum()), getattr(config.saturation, f"{sensor}_bound")
         if count:
             found.append(
-                f"{count} filled {name} values lie at the bound of {bound:g} SI beyond their rail: there the "
+                f"{count} filled {name} values lie at the bound of {bound:g} {unit} beyond their rail: there the "
                 f"bound decided, not the data (saturation.{sensor}_bound)."
             )
     if estimate.floor is not None and not bool(estimate.floor.converged):

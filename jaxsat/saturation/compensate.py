@@ -129,8 +129,8 @@ def _solve_all(
     for group in groups.values():
         for first in range(0, len(group), _BATCH):
             part = group[first : first + _BATCH]
-            # Two batch sizes only: each is a compilation of its own.
-            padded = part + [part[0]] * (_BATCH - len(part) if len(part) > 1 else 0)
+            # Two batch sizes only, since each is a compilation of its own: one for the lone segment, one for many.
+            padded = part + [part[0]] * (_BATCH - len(part) if len(segments) > 1 else 0)
             batch = jax.tree.map(lambda *xs: np.stack(xs), *[segment for _, segment in padded])
             result = jax.tree.map(np.asarray, _solve(batch, gravity, options))
             for row, (index, _) in enumerate(part):
@@ -206,7 +206,7 @@ def compensate_sequential(
 def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, stop: int):
     """The filtered state at sample `stop`, from that at `start` (whose rows are used already, but at 0)."""
     count = stop - start + 1
-    size = bucket(count, 64)
+    size = bucket(count, 256)
 
     def span(x):
         return pad(np.asarray(x)[start : stop + 1], size)

@@ -102,8 +102,11 @@ _NO_GAP = np.array([[0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
 
 
 def bucket(count: int, smallest: int) -> int:
-    """The next power of two: shapes are shared, so few programs are compiled."""
-    return max(smallest, 1 << max(0, int(count - 1).bit_length()))
+    """`smallest` times a power of four: coarse steps, so shapes are shared and few programs are compiled."""
+    size = smallest
+    while size < count:
+        size *= 4
+    return size
 
 
 def pad(x: np.ndarray, size: int) -> np.ndarray:
@@ -121,12 +124,12 @@ def gather(
 ) -> Segment:
     """One segment as a padded `Segment`; departure and arrival come from the whole recording."""
     start, stop = max(0, layout.segments.departure[index]), layout.segments.arrival[index]
-    n = bucket(stop - start, 64)
+    n = bucket(stop - start, 256)
     gaps, values = layout.gaps_of(index), layout.values_of(index)
     channel, sample = layout.channel[values], layout.sample[values]
     count = gaps.stop - gaps.start
     cut, element = np.unique(sample - start, return_inverse=True)
-    m, g = bucket(len(sample), 16), bucket(count, 4)
+    m = g = bucket(len(sample), 16)
     edges = np.concatenate([layout.edges[gaps], np.repeat(_NO_GAP, g - count, axis=0)])
     edges[:count, :2] -= start
     fields = jnp.asarray(edges.T)

@@ -84,7 +84,9 @@ def solve_segment(
     """
     search = search_space(method, segment, free_peak_time)
     condensed = condense(segment)
-    rows, weight = arrival_sensitivity(search.delta(search.start), condensed, gravity)
+    zero = jnp.zeros_like(segment.bound)
+    before = objective(zero, condensed, gravity)
+    rows, weight = arrival_sensitivity(zero, condensed, gravity)
     columns = jax.jacfwd(search.delta)(search.start).T @ rows
     curvature = jnp.einsum("pi,ij,pj->p", columns, weight, columns)
     # A variable that the data do not see is scaled by its range; one without range does not move.
@@ -93,8 +95,6 @@ def solve_segment(
         1.0 / jnp.sqrt(curvature + 1.0 / jnp.where(search.upper > 0.0, search.upper, 1.0) ** 2),
         1.0,
     )
-    zero = jnp.zeros_like(segment.bound)
-    before = objective(zero, condensed, gravity)
     solution = projected_gradient(
         lambda p: objective(search.delta(p), condensed, gravity),
         search.start,

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial import kalman
-from jaxsat.inertial.preintegration import gather_noise, input_effects, remainders, stretches
+from jaxsat.inertial.preintegration import alternate, input_effects, remainders, stretches
 from jaxsat.inertial.rotations import quat_conjugate, quat_multiply, quat_rotate, quat_to_matrix, skew
 from jaxsat.inertial.smoother import HEIGHT, Rows
 from jaxsat.inertial.strapdown import (
@@ -28,10 +28,8 @@ from jaxsat.inertial.strapdown import (
     NavState,
     Samples,
     advance,
-    compose,
     error_transition,
     noise_covariance,
-    prefixes,
     rotate_noise,
     sample_intervals,
     sample_noise,
@@ -82,7 +80,9 @@ class Condensed(eqx.Module):
     """
 
     stretches: Interval
-    """M+1 of them, with their noise."""
+    """M+1 of them."""
+    noise: Moments
+    """Of the stretches."""
     signal: Float[Array, "M1 6"]
     period: Float[Array, "M1"]
     variance: Float[Array, "M1 2"]
@@ -95,8 +95,10 @@ def condense(segment: Segment) -> Condensed:
     def pick(x):
         return jnp.concatenate([x.at[segment.cut].get(mode="fill", fill_value=0), jnp.zeros_like(x[:1])])
 
+    between, noise = stretches(segment.signal, segment.period, segment.variance, segment.cut)
     return Condensed(
-        stretches=stretches(segment.signal, segment.period, segment.variance, segment.cut),
+        stretches=between,
+        noise=noise,
         signal=pick(segment.signal),
         period=pick(segment.period),
         variance=pick(segment.variance),
@@ -108,11 +110,10 @@ def _fill(condensed: Condensed, delta: Float[Array, "m"]) -> tuple[Interval, Mom
     """The compensated signal ȳ = y + s·δ (Eq. 17) with the elements' prefixes and the noise of them all."""
     segment = condensed.segment
     signal = condensed.signal.at[segment.element, segment.channel].add(segment.sign * delta)
-    filled = sample_intervals(signal, condensed.period, condensed.variance)
-    elements = jax.vmap(compose)(condensed.stretches, filled)
-    upto = prefixes(elements)
-    assert elements.noise is not None  # for the type checker: both parts carry noise
-    return upto, gather_noise(elements.noise, upto), signal
+    upto, noise = alternate(
+        condensed.stretches, condensed.noise, signal, condensed.period, condensed.variance
+    )
+    return upto, noise, signal
 
 
 def _arrive(segment: Segment, upto: Interval, noise: Moments, gravity: Float[Array, ""]):

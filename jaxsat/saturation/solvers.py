@@ -3,7 +3,6 @@
 import enum
 import warnings
 from collections.abc import Callable
-from typing import cast
 
 import equinox as eqx
 import jax
@@ -57,11 +56,12 @@ def projected_gradient(
     """Minimise fun over lower ≤ x ≤ upper by accelerated projected gradient with restarts.
 
     scale: the change of each x that moves fun by about ½ (1/√ of the Hessian's diagonal). The search runs in
-    u = x / scale on fun divided by the number of variables, so curvature is at most about 1 in any direction:
+    u = x / scale on fun divided by the number of free variables, so curvature is at most about 1 in any direction:
     `jaxopt.ProjectedGradient` restarts its step at 1 and can stop far from the optimum otherwise. Whether it
     has arrived is decided by the residual of the solution, not by the solver's own step length.
     """
-    low, high, share = lower / scale, upper / scale, 1.0 / start.size
+    low, high = lower / scale, upper / scale
+    share = 1.0 / jnp.maximum(jnp.sum(upper > lower), 1).astype(start.dtype)
 
     def assess(u):
         value, gradient = jax.value_and_grad(lambda u: fun(u * scale))(u)
@@ -70,8 +70,6 @@ def projected_gradient(
     solver = jaxopt.ProjectedGradient(
         fun=lambda u: share * fun(u * scale),
         projection=lambda u, box: optax.projections.projection_box(u, *box),
-        maxiter=_STEPS_PER_ROUND,
-        tol=cast(float, 0.01 * share * tolerance),
         maxls=30,
     )
 
@@ -79,16 +77,24 @@ def projected_gradient(
         _, _, error, count = carry
         return (error > tolerance) & (count < max_iterations)
 
+    def one_step(carry):
+        return solver.update(*carry, hyperparams_proj=(low, high))
+
+    def still_moving(carry):
+        state = carry[1]
+        return (state.iter_num < _STEPS_PER_ROUND) & (state.error > 0.01 * share * tolerance)
+
     def one_round(carry):
         u, value, error, count = carry
-        step = solver.run(u, hyperparams_proj=(low, high))
-        new_u = optax.projections.projection_box(step.params, low, high)
+        fresh = (u, solver.init_state(u, (low, high)))
+        step_u, state = jax.lax.while_loop(still_moving, lambda c: tuple(one_step(c)), fresh)
+        new_u = optax.projections.projection_box(step_u, low, high)
         new_value, new_error = assess(new_u)
         better = new_value < value
         u, value, error = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (new_u, new_value, new_error), (u, value, error)
         )
-        return u, value, error, count + step.state.iter_num
+        return u, value, error, count + state.iter_num
 
     u = optax.projections.projection_box(start / scale, low, high)
     infinite = jnp.full((), jnp.inf, start.dtype)

@@ -1,0 +1,138 @@
+"""f(δ) in closed form against the sample-by-sample filter, and its derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+from jaxsat.inertial.smoother import smooth_about
+from jaxsat.inertial.strapdown import NavState, Samples, add_error, strapdown
+from jaxsat.saturation.gap_shapes import Edges
+from jaxsat.saturation.segment import Segment, arrival_sensitivity, arrivals, condense, objective
+
+MOVING, RESTING = 64, 40
+N = MOVING + RESTING
+CUT, ELEMENT, CHANNEL = [20, 21, 22, 40, 41], [0, 1, 1, 2, 3, 4], [1, 1, 5, 1, 2, 4]
+SAMPLES = problems.samples(N, seed=5, isotropic=True)
+REST = np.arange(N) >= MOVING
+
+
+def arrival_table():
+    start = np.arange(N) == MOVING
+    where = jnp.asarray(np.where(REST, 0, -1))
+    return jax.jit(arrivals, static_argnums=4)(SAMPLES, problems.rows(REST), where, jnp.asarray(start), 1)
+
+
+def build(height: bool, departure=None) -> Segment:
+    state, covariance = problems.departure() if departure is None else departure
+    no_gap = jnp.zeros(1)
+    return Segment(
+        signal=SAMPLES.signal[:MOVING],
+        period=SAMPLES.period[:MOVING],
+        variance=SAMPLES.variance[:MOVING, jnp.array([0, 3])],
+        cut=jnp.array([*CUT, MOVING, MOVING, MOVING]),
+        element=jnp.array([*ELEMENT, 0, 0]),
+        channel=jnp.array([*CHANNEL, 0, 0]),
+        sign=jnp.array([1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 0.0, 0.0]),
+        bound=jnp.array([5.0] * 6 + [0.0] * 2),
+        gap=jnp.zeros(8, int),
+        edges=Edges(*[no_gap] * 7, sound=no_gap > 0),
+        departure=state,
+        departure_covariance=covariance,
+        arrival=arrival_table()[0],
+        height=jnp.asarray(height),
+        height_variance=jnp.asarray(4e-4),
+    )
+
+
+F = jax.jit(lambda delta, segment: objective(delta, condense(segment), problems.GRAVITY))
+DELTA = jnp.asarray(np.random.default_rng(1).uniform(0.0, 2.0, 8))
+
+
+def oracle(delta, height: bool, departure=None):
+    """J* of the linear filter over moving and resting samples, about the open-loop strapdown."""
+    state, covariance = problems.departure() if departure is None else departure
+    segment = build(height, departure)
+    sample = jnp.asarray(CUT)[segment.element[:6]]
+    signal = SAMPLES.signal.at[sample, segment.channel[:6]].add(segment.sign[:6] * delta[:6])
+    samples = Samples(signal, SAMPLES.period, SAMPLES.variance)
+    reference = strapdown(signal, SAMPLES.period, state, problems.GRAVITY)
+    first = np.arange(N) == MOVING
+    rows = problems.rows(REST, first if height else None)
+    return smooth_about(reference, samples, rows, state, covariance, problems.GRAVITY).cost
+
+
+@pytest.mark.parametrize("height", [False, True])
+def test_objective_and_gradient_equal_the_sample_by_sample_filter(height):
+    segment = build(height)
+    value, gradient = jax.jit(jax.value_and_grad(lambda d: oracle(d, height)))(DELTA)
+    np.testing.assert_allclose(F(DELTA, segment), value, rtol=1e-10)
+    found = jax.jit(jax.grad(F))(DELTA, segment)
+    np.testing.assert_allclose(found, gradient, atol=1e-10 * np.abs(gradient).max())
+
+
+def test_gradient_equals_central_differences_and_forward_mode():
+    segment = build(False)
+    reverse = jax.jit(jax.grad(F))(DELTA, segment)
+    forward = jax.jit(jax.jacfwd(F))(DELTA, segment)
+    step = 1e-5
+    numeric = [(F(DELTA + step * e, segment) - F(DELTA - step * e, segment)) / (2 * step) for e in np.eye(8)]
+    scale = np.abs(reverse).max()
+    np.testing.assert_allclose(reverse, forward, atol=1e-10 * scale)
+    np.testing.assert_allclose(reverse, np.array(numeric), atol=1e-6 * scale)
+    assert not reverse[6:].any(), "padded values have no influence"
+
+
+def test_objective_does_not_depend_on_heading_or_position():
+    state, covariance = problems.departure()
+    covariance = jnp.diag(jnp.array([1e-4, 1e-4, 1e-4, 0, 0, 0, 1e-4, 1e-4, 1e-4]))
+    angle = 0.8
+    spin = jnp.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    turned = add_error(state, jnp.array([0, 0, angle, 7.0, -2.0, 1.0, 0, 0, 0]))
+    turned = NavState(turned.q_nb, spin @ state.velocity, turned.position)
+    here, there = build(False, (state, covariance)), build(False, (turned, covariance))
+    np.testing.assert_allclose(F(DELTA, here), F(DELTA, there), rtol=1e-10)
+
+
+def test_padding_changes_nothing():
+    segment = build(False)
+    longer = jax.tree.map(lambda x: x, segment)
+    pad = lambda x: jnp.concatenate([x, jnp.zeros((64, *x.shape[1:]))])  # noqa: E731
+    longer = Segment(
+        **{
+            **{f: getattr(segment, f) for f in segment.__dataclass_fields__},
+            "signal": pad(segment.signal),
+            "period": pad(segment.period),
+            "variance": pad(segment.variance),
+            "cut": jnp.array([*CUT, 128, 128, 128]),
+        }
+    )
+    np.testing.assert_allclose(F(DELTA, longer), F(DELTA, segment), rtol=1e-12)
+
+
+def test_gauss_newton_factors_give_the_hessian_where_the_fit_is_good():
+    """At zero residual second derivatives of the model vanish from the Hessian."""
+    segment = build(False)
+    far = condense(segment)
+    rows, weight = arrival_sensitivity(DELTA, far, problems.GRAVITY)
+    assert rows.shape == (8, 6) and not rows[6:].any()
+    hessian = jax.hessian(lambda d: objective(d, far, problems.GRAVITY))
+    # Take the curvature of ½ eᵀ M e along the measured sensitivity of the arrival itself.
+    gauss_newton = rows @ weight @ rows.T
+    assert np.linalg.matrix_rank(gauss_newton, tol=1e-6 * np.linalg.norm(gauss_newton)) <= 6
+    curvature = hessian(DELTA)
+    residual_share = np.linalg.norm(curvature - gauss_newton) / np.linalg.norm(gauss_newton)
+    assert np.isfinite(residual_share)
+
+
+def test_no_rest_after_means_no_information():
+    segment = build(False)
+    blind = Segment(
+        **{
+            **{f: getattr(segment, f) for f in segment.__dataclass_fields__},
+            "arrival": jnp.zeros((10, 10)),
+        }
+    )
+    assert F(DELTA, blind) == 0.0
+    assert not jax.grad(F)(DELTA, blind).any()
