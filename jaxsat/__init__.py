@@ -3,16 +3,14 @@
 The public names are loaded when they are first used, so that importing the package costs nothing.
 """
 
-import sys
 from importlib import import_module
 from importlib.metadata import version
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxsat.config import Config, load_config
     from jaxsat.errors import InputError
-    from jaxsat.estimate import Estimate, Trajectory, estimate
+    from jaxsat.pipeline import Estimate, Trajectory, estimate
     from jaxsat.present.folder import write_results
     from jaxsat.signals.readers import read
     from jaxsat.signals.recording import Recording
@@ -22,13 +20,13 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Config": "jaxsat.config",
-    "Estimate": "jaxsat.estimate",
+    "Estimate": "jaxsat.pipeline",
     "InputError": "jaxsat.errors",
     "MOTIONS": "jaxsat.studies.motions",
     "Recording": "jaxsat.signals.recording",
     "Sensor": "jaxsat.studies.simulate",
-    "Trajectory": "jaxsat.estimate",
-    "estimate": "jaxsat.estimate",
+    "Trajectory": "jaxsat.pipeline",
+    "estimate": "jaxsat.pipeline",
     "load_config": "jaxsat.config",
     "position_rmse": "jaxsat.studies.metrics",
     "read": "jaxsat.signals.readers",
@@ -65,14 +63,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
-
-
-class _Package(ModuleType):
-    def __setattr__(self, name: str, value: Any) -> None:
-        # Importing the module `jaxsat.estimate` must not hide the function of that name.
-        if name == "estimate" and isinstance(value, ModuleType):
-            value = value.estimate
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -124,14 +124,13 @@ def estimate_command(
     given = {key: value for key, value in given.items() if value is not None}
     settings = load_config(config, **given, **_rails(gyr_rail, acc_rail, gyr_unit, acc_unit))
     _use_compilation_cache()
-    from jaxsat.estimate import estimate
+    from jaxsat.pipeline import estimate
 
     with _progress(quiet) as progress:
         found = estimate(measured, settings, progress=progress)
         beside = {}
         if settings.method != "standard" and len(found.gaps):
-            plain = estimate(measured, settings.model_copy(update={"method": "standard"})).trajectory
-            beside["standard"] = (plain.time, plain.position)
+            beside["standard"] = (measured.time, found.standard_position)
         report = write_results(found, out, csv=csv, source=recording, beside=beside)
     warnings = warnings_of(found)
     if not quiet:

@@ -8,7 +8,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from jaxsat.config import Config
-from jaxsat.estimate import Estimate, Progress, estimate
+from jaxsat.pipeline import Estimate, Progress, estimate
 from jaxsat.present.folder import check_folder, write_results
 from jaxsat.present.summary import warnings_of
 from jaxsat.present.text import columns

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from jaxsat.config import load_config
-from jaxsat.estimate import estimate
+from jaxsat.pipeline import estimate
 from jaxsat.signals.readers import read
 from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse, pyshoe_error
 

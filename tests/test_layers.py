@@ -12,7 +12,7 @@ ORDER = (
     "inertial",
     "saturation",
     "config",
-    "estimate",
+    "pipeline",
     "studies",
     "present",
     "demo",
@@ -52,8 +52,8 @@ def test_no_import_points_up(path):
 
 
 def test_an_upward_import_is_seen():
-    text = "def f():\n    from jaxsat.estimate import estimate\n    import numpy, jaxsat.present.tables\n"
-    assert upward(PACKAGE / "signals" / "rails.py", text) == ["jaxsat.estimate", "jaxsat.present.tables"]
+    text = "def f():\n    from jaxsat.pipeline import estimate\n    import numpy, jaxsat.present.tables\n"
+    assert upward(PACKAGE / "signals" / "rails.py", text) == ["jaxsat.pipeline", "jaxsat.present.tables"]
     assert upward(PACKAGE / "cli.py", text) == []
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from jaxsat.config import Config
-from jaxsat.estimate import Estimate, estimate
+from jaxsat.pipeline import Estimate, estimate
 from jaxsat.present.plots import POINTS, height_figure, path_figure, signals_figure, thin
 from jaxsat.present.report import render_report
 from jaxsat.present.summary import summarise

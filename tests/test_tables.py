@@ -11,7 +11,7 @@ import pytest
 
 from jaxsat.config import Config
 from jaxsat.errors import InputError
-from jaxsat.estimate import estimate
+from jaxsat.pipeline import estimate
 from jaxsat.present import folder as folder_module
 from jaxsat.present.folder import check_folder, write_results
 from jaxsat.present.summary import inspect, summarise, warnings_of

@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 
 from jaxsat.errors import InputError
-from jaxsat.estimate import Estimate
+from jaxsat.pipeline import Estimate
 from jaxsat.present.report import Track, render_report
 from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table, signals_table, trajectory_table

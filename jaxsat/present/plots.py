@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from jaxtyping import Bool, Float, Int
 from plotly.subplots import make_subplots
 
-from jaxsat.estimate import Estimate
+from jaxsat.pipeline import Estimate
 from jaxsat.signals.recording import CHANNELS
 from jaxsat.signals.rests import runs
 

@@ -11,7 +11,7 @@ import pandas as pd
 import plotly.io
 import plotly.offline
 
-from jaxsat.estimate import Estimate
+from jaxsat.pipeline import Estimate
 from jaxsat.present.plots import Track, height_figure, path_figure, signals_figure
 from jaxsat.present.text import plural
 from jaxsat.signals.recording import CHANNELS

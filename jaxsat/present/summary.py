@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxsat.config import Config
-from jaxsat.estimate import Estimate
+from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsat.estimate import Estimate
+from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
 

@@ -144,14 +144,13 @@ def compensate_parallel(
 ) -> Fills:
     """Solve all segments at once from one filter pass over the recording; then again with the filled signal.
 
-    In the first pass nothing is known of the saturated values but their bounds: they enter as measured, with
-    the second moment of a uniform 0 ≤ δ ≤ δ_b as additional variance, so that departures know how uncertain
-    their tilt is. Later passes filter the filled signal with sensor noise alone.
+    Methods 1 and 2 do not say how sure they are of a filled value, so each enters the filter with the variance
+    that its bounds leave: departures know how uncertain their tilt is, and one bad fill does not bend what
+    follows. In the first pass δ is 0 and the variance is the second moment about it.
     """
     busy = np.unique(layout.gap_segment)
     fills = Fills.nothing(trial, len(layout.segments))
     table = arrival_table(trial, layout)
-    unknown = np.where(trial.sign != 0, trial.bound**2 / 3.0, 0.0)
     count = 0
 
     def done(more: int) -> None:
@@ -161,7 +160,8 @@ def compensate_parallel(
             progress(count, sweeps * len(busy))
 
     for sweep in range(sweeps):
-        variance = trial.variance + unknown if sweep == 0 else trial.variance
+        # The second moment of a uniform distribution about its end is four times that about its middle.
+        variance = trial.variance + (4.0 if sweep == 0 else 1.0) * trial.fill_variance
         states, covariances = _filter(
             fills.signal,
             trial.period,
@@ -220,7 +220,7 @@ def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, st
     states, covariances = _filter(
         span(signal),
         span(trial.period),
-        span(trial.variance),
+        span(trial.variance + trial.fill_variance),
         rows,
         state,
         covariance,

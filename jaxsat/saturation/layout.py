@@ -31,6 +31,11 @@ class Trial(eqx.Module):
     prior_covariance: Float[np.ndarray, "9 9"]
     gravity: Float[np.ndarray, ""]
 
+    @property
+    def fill_variance(self) -> Float[np.ndarray, "N 6"]:
+        """Variance of a filled value of which only the bounds are known: uniform in 0 ≤ δ ≤ δ_b."""
+        return np.where(self.sign != 0, self.bound**2 / 12.0, 0.0)
+
 
 class Layout(eqx.Module):
     """Segments, gaps and saturated values of a recording in the order of time, so each segment is a slice."""

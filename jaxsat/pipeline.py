@@ -59,6 +59,8 @@ class Estimate(eqx.Module):
     """sd of each value of `filled`: sensor noise, or where it was filled by methods 1 and 2 that of a value
     anywhere within its bounds, because they do not say more."""
     fills: Fills
+    standard_position: Float[np.ndarray, "N 3"]
+    """Where the standard smoother, which ignores saturation, puts the sensor (m)."""
     cost: Float[np.ndarray, ""]
     """J* of the whole recording as reported."""
     cost_standard: Float[np.ndarray, ""]
@@ -116,7 +118,9 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     standard, floor = _smooth(trial, config)
     smoothed = standard
     clock.lap("smoother")
+    compensated = False
     if config.method != "standard" and len(gaps):
+        compensated = True
         options = Options(
             config.method,
             config.saturation.free_peak_time,
@@ -133,11 +137,14 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         else:
             fills = compensate_sequential(searched, layout, options, report)
         clock.lap("compensation")
-        smoothed, floor = _smooth(eqx.tree_at(lambda t: t.signal, trial, fills.signal), config)
+        # A filled value is known to lie within its bounds, no better.
+        filled = eqx.tree_at(
+            lambda t: (t.signal, t.variance), trial, (fills.signal, trial.variance + trial.fill_variance)
+        )
+        smoothed, floor = _smooth(filled, config)
         clock.lap("smoother")
 
     n = len(recording)
-    sensor_sd = np.sqrt(trial.variance)
     offsets = np.concatenate([offset, np.zeros(3)])
     filled = np.where(sign != 0, fills.signal + offsets, recording.signal)
     return Estimate(
@@ -156,8 +163,9 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         gaps=gaps,
         sign=sign,
         filled=filled,
-        signal_sd=np.where(sign != 0, trial.bound / np.sqrt(12.0), sensor_sd),
+        signal_sd=np.sqrt(trial.variance + (trial.fill_variance if compensated else 0.0)),
         fills=fills,
+        standard_position=np.asarray(standard.state.position)[:n],
         cost=np.asarray(smoothed.cost),
         cost_standard=np.asarray(standard.cost),
         gravity=float(trial.gravity),
