@@ -56,27 +56,20 @@ def update_rows(
     covariance: Float[Array, "9 9"],
     state: NavState,
     rows: Rows,
+    rest: Bool[Array, ""],
+    height: Bool[Array, ""],
 ) -> tuple[Float[Array, "9"], Float[Array, "9 9"], Float[Array, ""], list[kalman.Row]]:
-    """All rows of one state (rows: one example) on the error about the reference `state`."""
+    """The rows of one state on the error about the reference `state`; rest, height: its flags in `rows`."""
     cost, done = jnp.zeros_like(state.velocity[0]), []
     for axis, index in enumerate(VELOCITY):
         mean, covariance, extra, row = kalman.update_row(
-            mean, covariance, index, -state.velocity[axis], rows.velocity_variance, rows.rest
+            mean, covariance, index, -state.velocity[axis], rows.velocity_variance, rest
         )
         cost, done = cost + extra, [*done, row]
     mean, covariance, extra, row = kalman.update_row(
-        mean, covariance, HEIGHT, -state.position[2], rows.height_variance, rows.height
+        mean, covariance, HEIGHT, -state.position[2], rows.height_variance, height
     )
     return mean, covariance, cost + extra, [*done, row]
-
-
-def _row_axes(rows: Rows) -> Rows:
-    """Which leaves of `rows` have a time axis, for vmap and scan."""
-    return Rows(rest=rows.rest, velocity_variance=None, height=rows.height, height_variance=None)  # type: ignore
-
-
-def _at(rows: Rows, timed: Rows) -> Rows:
-    return eqx.combine(timed, rows, is_leaf=lambda x: x is None)
 
 
 def closed_loop(
@@ -94,9 +87,9 @@ def closed_loop(
 
     def step(carry, inputs):
         state, covariance = carry
-        interval, sample, timed = inputs
+        interval, sample, rest, height = inputs
         mean, covariance, _, _ = update_rows(
-            jnp.zeros(9, covariance.dtype), covariance, state, _at(rows, timed)
+            jnp.zeros(9, covariance.dtype), covariance, state, rows, rest, height
         )
         state = add_error(state, mean)
         _, predicted = kalman.predict(
@@ -109,7 +102,9 @@ def closed_loop(
         return (advance(state, interval, gravity), predicted), (state, covariance)
 
     intervals = sample_intervals(samples.signal, samples.period)
-    last, corrected = jax.lax.scan(step, (prior, prior_covariance), (intervals, samples, _row_axes(rows)))
+    last, corrected = jax.lax.scan(
+        step, (prior, prior_covariance), (intervals, samples, rows.rest, rows.height)
+    )
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last)
 
 
@@ -133,8 +128,8 @@ def smooth_about(
 
     def forward(carry, inputs):
         mean, covariance, cost = carry
-        state, interval, sample, offset, timed = inputs
-        mean, covariance, extra, row = update_rows(mean, covariance, state, _at(rows, timed))
+        state, interval, sample, offset, rest, height = inputs
+        mean, covariance, extra, row = update_rows(mean, covariance, state, rows, rest, height)
         predicted = kalman.predict(
             mean,
             covariance,
@@ -158,7 +153,7 @@ def smooth_about(
     (last_mean, last_covariance, cost), (mean, covariance, row) = jax.lax.scan(
         forward,
         (initial_error, prior_covariance, zero),
-        (start, intervals, samples, offsets, _row_axes(rows)),
+        (start, intervals, samples, offsets, rows.rest, rows.height),
     )
     nothing = kalman.Adjoint(jnp.zeros_like(last_mean), jnp.zeros_like(last_covariance))
     _, (error, smoothed, multiplier) = jax.lax.scan(

@@ -1,7 +1,6 @@
 """All segments of a recording, in parallel or one after the other (paper A, Section 5)."""
 
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -15,9 +14,6 @@ from jaxsat.saturation.layout import Layout, Trial, bucket, gather, pad
 from jaxsat.saturation.methods import Compensation, SegmentFill, solve_segment
 from jaxsat.saturation.segment import Segment, arrivals
 from jaxsat.saturation.solvers import Status
-
-# Segments that are solved in one call: more share its overhead, but all wait for the slowest.
-_BATCH = 16
 
 Progress = Callable[[int, int], None]
 """Called with (segments done, segments in all)."""
@@ -70,17 +66,15 @@ def _arrivals(signal, period, variance, rows: Rows, segment_at, starts, count: i
 
 
 @eqx.filter_jit
-def _solve(batch: Segment, gravity, options: Options) -> SegmentFill:
-    return jax.vmap(
-        lambda segment: solve_segment(
-            segment,
-            gravity,
-            jnp.asarray(options.tolerance),
-            options.method,
-            options.free_peak_time,
-            options.max_iterations,
-        )
-    )(batch)
+def _solve(segment: Segment, gravity, options: Options) -> SegmentFill:
+    return solve_segment(
+        segment,
+        gravity,
+        jnp.asarray(options.tolerance),
+        options.method,
+        options.free_peak_time,
+        options.max_iterations,
+    )
 
 
 def arrival_table(trial: Trial, layout: Layout) -> Float[np.ndarray, "S 10 10"]:
@@ -106,6 +100,7 @@ def arrival_table(trial: Trial, layout: Layout) -> Float[np.ndarray, "S 10 10"]:
 
 def _record(fills: Fills, trial: Trial, layout: Layout, index: int, found: SegmentFill) -> None:
     """Write what was found for one segment into the arrays of the whole recording."""
+    found = jax.tree.map(np.asarray, found)
     mine = layout.values_of(index)
     sample, channel = layout.sample[mine], layout.channel[mine]
     count = len(sample)
@@ -118,31 +113,10 @@ def _record(fills: Fills, trial: Trial, layout: Layout, index: int, found: Segme
     fills.residual[index], fills.iterations[index] = found.solution.residual, found.solution.iterations
 
 
-def _solve_all(
-    segments: Sequence[tuple[int, Segment]], gravity, options: Options, done: Callable[[int], None]
-) -> list[tuple[int, SegmentFill]]:
-    """Solve segments of like shape together, a fixed number a call."""
-    groups = defaultdict(list)
-    for index, segment in segments:
-        groups[tuple(x.shape for x in jax.tree.leaves(segment))].append((index, segment))
-    found = []
-    for group in groups.values():
-        for first in range(0, len(group), _BATCH):
-            part = group[first : first + _BATCH]
-            # Two batch sizes only, since each is a compilation of its own: one for the lone segment, one for many.
-            padded = part + [part[0]] * (_BATCH - len(part) if len(segments) > 1 else 0)
-            batch = jax.tree.map(lambda *xs: np.stack(xs), *[segment for _, segment in padded])
-            result = jax.tree.map(np.asarray, _solve(batch, gravity, options))
-            for row, (index, _) in enumerate(part):
-                found.append((index, jax.tree.map(lambda x, row=row: x[row], result)))
-            done(len(part))
-    return found
-
-
 def compensate_parallel(
     trial: Trial, layout: Layout, options: Options, sweeps: int = 2, progress: Progress | None = None
 ) -> Fills:
-    """Solve all segments at once from one filter pass over the recording; then again with the filled signal.
+    """Solve each segment on its own from one filter pass over the recording; then again with the filled signal.
 
     Methods 1 and 2 do not say how sure they are of a filled value, so each enters the filter with the variance
     that its bounds leave: departures know how uncertain their tilt is, and one bad fill does not bend what
@@ -152,12 +126,6 @@ def compensate_parallel(
     fills = Fills.nothing(trial, len(layout.segments))
     table = arrival_table(trial, layout)
     count = 0
-
-    def done(more: int) -> None:
-        nonlocal count
-        count += more
-        if progress:
-            progress(count, sweeps * len(busy))
 
     for sweep in range(sweeps):
         # The second moment of a uniform distribution about its end is four times that about its middle.
@@ -172,13 +140,14 @@ def compensate_parallel(
             trial.gravity,
         )
         states, covariances = jax.tree.map(np.asarray, (states, covariances))
-        work = []
         for i in busy:
             at = max(0, int(layout.segments.departure[i]))
             state = NavState(states.q_nb[at], states.velocity[at], states.position[at])
-            work.append((i, gather(trial, layout, i, state, covariances[at], table[i])))
-        for index, found in _solve_all(work, trial.gravity, options, done):
-            _record(fills, trial, layout, index, found)
+            segment = gather(trial, layout, i, state, covariances[at], table[i])
+            _record(fills, trial, layout, i, _solve(segment, trial.gravity, options))
+            count += 1
+            if progress:
+                progress(count, sweeps * len(busy))
     return fills
 
 
@@ -196,8 +165,7 @@ def compensate_sequential(
         state, covariance = _filter_to(trial, fills.signal, state, covariance, at, departure)
         at = departure
         segment = gather(trial, layout, index, state, covariance, table[index])
-        for _, found in _solve_all([(index, segment)], trial.gravity, options, lambda _: None):
-            _record(fills, trial, layout, index, found)
+        _record(fills, trial, layout, index, _solve(segment, trial.gravity, options))
         if progress:
             progress(count + 1, len(busy))
     return fills

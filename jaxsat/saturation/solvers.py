@@ -27,6 +27,8 @@ class Status(enum.IntEnum):
     """There was nothing to search."""
     NO_ARRIVAL = 3
     """No rest follows, so the data say nothing; the start is returned."""
+    STALLED = 4
+    """A whole round lowered the value by less than a thousandth of the tolerance (relative): a kink, mostly."""
 
 
 class Solution(eqx.Module):
@@ -70,34 +72,38 @@ def projected_gradient(
     solver = jaxopt.ProjectedGradient(
         fun=lambda u: share * fun(u * scale),
         projection=lambda u, box: optax.projections.projection_box(u, *box),
-        maxls=30,
+        maxls=15,
     )
 
     def proceed(carry):
-        _, _, error, count = carry
-        return (error > tolerance) & (count < max_iterations)
+        _, _, error, count, stalled = carry
+        return (error > tolerance) & (count < max_iterations) & ~stalled
 
     def one_step(carry):
-        return solver.update(*carry, hyperparams_proj=(low, high))
+        return tuple(solver.update(*carry, hyperparams_proj=(low, high)))
 
     def still_moving(carry):
         state = carry[1]
         return (state.iter_num < _STEPS_PER_ROUND) & (state.error > 0.01 * share * tolerance)
 
     def one_round(carry):
-        u, value, error, count = carry
-        fresh = (u, solver.init_state(u, (low, high)))
-        step_u, state = jax.lax.while_loop(still_moving, lambda c: tuple(one_step(c)), fresh)
-        new_u = optax.projections.projection_box(step_u, low, high)
-        new_value, new_error = assess(new_u)
-        better = new_value < value
+        u, value, error, count, _ = carry
+        u_end, state = jax.lax.while_loop(still_moving, one_step, (u, solver.init_state(u, (low, high))))
+        u_end = optax.projections.projection_box(u_end, low, high)
+        end_value, end_error = assess(u_end)
+        better = end_value < value
+        # In the first round there is nothing to compare with: value is infinite.
+        stalled = jnp.isfinite(value) & (value - end_value < 1e-3 * tolerance * (1.0 + jnp.abs(value)))
         u, value, error = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), (new_u, new_value, new_error), (u, value, error)
+            lambda new, old: jnp.where(better, new, old), (u_end, end_value, end_error), (u, value, error)
         )
-        return u, value, error, count + state.iter_num
+        return u, value, error, count + state.iter_num, stalled
 
     u = optax.projections.projection_box(start / scale, low, high)
     infinite = jnp.full((), jnp.inf, start.dtype)
-    u, value, error, count = jax.lax.while_loop(proceed, one_round, (u, infinite, infinite, jnp.asarray(0)))
-    status = jnp.where(error <= tolerance, Status.CONVERGED, Status.MAX_ITERATIONS)
+    u, value, error, count, stalled = jax.lax.while_loop(
+        proceed, one_round, (u, infinite, infinite, jnp.asarray(0), jnp.asarray(False))
+    )
+    unfinished = jnp.where(stalled, Status.STALLED, Status.MAX_ITERATIONS)
+    status = jnp.where(error <= tolerance, Status.CONVERGED, unfinished)
     return Solution(x=u * scale, value=value, residual=error, iterations=count, status=status)

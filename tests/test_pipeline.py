@@ -1,0 +1,162 @@
+"""The whole way on simulated recordings: the paper's ratios, no harm without saturation, both orders of segments."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from jaxsat.config import load_config
+from jaxsat.errors import InputError
+from jaxsat.pipeline import estimate
+from jaxsat.studies.metrics import position_rmse
+from jaxsat.studies.motions import Bar, Walk
+from jaxsat.studies.simulate import Sensor, simulate
+
+BAR = {"saturation.gyr_bound": 5.0, "rails.gyr": 7.5}
+PAPER = {"direct": 0.070, "triangle": 0.098, "quadratic": 0.079}
+"""Last-position error over that of the standard smoother, from Table 1 of Dang & Suh 2014."""
+
+
+def bar(seed: int, **sensor):
+    recording, truth = simulate(
+        Bar(), rate=100.0, duration=1.6, sensor=Sensor(**sensor), key=jax.random.key(seed)
+    )
+    return eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None), truth
+
+
+def walk(strides: int, seed: int = 1, **sensor):
+    motion = Walk(strides=strides)
+    duration = float(motion.moving[-1, 1]) + 1.0
+    recording, truth = simulate(
+        motion, rate=100.0, duration=duration, sensor=Sensor(**sensor), key=jax.random.key(seed)
+    )
+    return eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None), truth
+
+
+def last_error(found, truth) -> float:
+    return float(np.linalg.norm(found.trajectory.position[-1] - truth.position[-1]))
+
+
+@pytest.mark.parametrize("method", PAPER)
+def test_bar_of_the_paper_is_compensated_at_least_as_well_as_in_table_1(method):
+    """Rail 7.5 of a peak of 11 rad/s, δ_b = 5; median of 20 seeds."""
+    ratios = []
+    for seed in range(20):
+        recording, truth = bar(seed, gyr_rail=7.5)
+        standard = np.linalg.norm(
+            estimate(recording, load_config(None, method="standard", **BAR)).trajectory.position[-1]
+            - truth.position[-1]
+        )
+        found = estimate(recording, load_config(None, method=method, **BAR))
+        assert found.fills.status.tolist() == [0] and found.fills.residual.max() <= 1e-2
+        ratios.append(last_error(found, truth) / standard)
+    assert np.median(ratios) <= PAPER[method]
+
+
+def test_filled_signal_lies_beyond_the_rail_and_near_the_truth():
+    recording, truth = bar(3, gyr_rail=7.5)
+    found = estimate(recording, load_config(None, method="quadratic", **BAR))
+    where = truth.saturated
+    assert (found.saturated == where).all() and where.sum() == 22
+    added = (found.filled - recording.signal)[where] * found.sign[where]
+    assert (added >= 0.0).all() and (added <= 5.0).all()
+    assert (found.filled == recording.signal)[~where].all()
+    error = np.sqrt(np.mean((found.filled - truth.signal)[where] ** 2))
+    ignored = np.sqrt(np.mean((recording.signal - truth.signal)[where] ** 2))
+    assert error < 0.1 * ignored
+
+
+@pytest.mark.parametrize("method", PAPER)
+def test_without_saturation_every_method_is_standard_to_the_last_bit(method):
+    recording, _ = bar(0)
+    plain = estimate(recording, load_config(None, method="standard"))
+    found = estimate(recording, load_config(None, method=method))
+    for a, b in zip(jax.tree.leaves(plain.trajectory), jax.tree.leaves(found.trajectory), strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert found.filled.tobytes() == recording.signal.tobytes()
+
+
+def test_parallel_and_sequential_segments_agree_on_a_walk():
+    """Section 5 of the paper against all segments at once: the same fills to a few percent of what they add."""
+    recording, truth = walk(4, gyr_rail=6.0)
+    settings = {"method": "direct", "rails.gyr": 6.0, "saturation.gyr_bound": 4.0}
+    both = [
+        estimate(recording, load_config(None, **settings, **{"saturation.segments": order}))
+        for order in ("parallel", "sequential")
+    ]
+    plain = estimate(recording, load_config(None, **{**settings, "method": "standard"}))
+    errors = [position_rmse(e.trajectory.position, truth.position) for e in (*both, plain)]
+    assert max(errors[:2]) < 0.1 * errors[2]
+    added = [np.abs(e.filled - recording.signal).sum() for e in both]
+    np.testing.assert_allclose(added[0], added[1], rtol=0.05)
+    assert abs(errors[0] - errors[1]) < 0.05 * errors[2]
+
+
+def test_free_peak_time_converges_and_stays_inside_its_bounds():
+    recording, truth = bar(2, gyr_rail=7.5)
+    found = estimate(
+        recording, load_config(None, method="triangle", **BAR, **{"saturation.free_peak_time": True})
+    )
+    added = (found.filled - recording.signal)[truth.saturated]
+    assert found.fills.status.tolist() == [0]
+    assert (added >= 0.0).all() and (added <= 5.0).all()
+    assert last_error(found, truth) < 0.1 * np.linalg.norm(found.standard_position[-1] - truth.position[-1])
+
+
+def test_heading_and_place_of_the_sensor_do_not_matter():
+    """The same motion recorded by a sensor that is mounted turned about its own axes."""
+    recording, _ = bar(5, gyr_rail=7.5)
+    turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    signal = np.concatenate([recording.gyr @ turn.T, recording.acc @ turn.T], axis=1)
+    settings = load_config(None, method="direct", **BAR)
+    a = estimate(recording, settings).trajectory.position
+    b = estimate(recording.with_signal(signal), settings).trajectory.position
+    assert position_rmse(a, b) < 1e-6
+    assert np.ptp(a, axis=0).max() > 0.5
+
+
+def test_height_modes_hold_the_rests_at_or_above_the_floor():
+    recording, _ = walk(4, gyr_rail=6.0)
+    settings = {"method": "standard", "rails.gyr": 6.0}
+    heights = {}
+    for mode in ("off", "zero", "nonnegative"):
+        found = estimate(recording, load_config(None, **settings, **{"height.mode": mode}))
+        arrivals = found.segments.arrival
+        heights[mode] = found.trajectory.position[arrivals, 2]
+        assert (found.floor is not None) == (mode == "nonnegative")
+        if found.floor is not None:
+            assert found.floor.converged and set(np.flatnonzero(found.floor.active)) <= set(arrivals)
+    assert np.abs(heights["zero"]).max() < 0.5 * np.abs(heights["off"]).max()
+    assert heights["nonnegative"].min() > -1e-6
+
+
+def test_covariance_grows_in_motion_and_is_small_at_rest():
+    recording, truth = walk(4)
+    found = estimate(recording, load_config(None, method="standard"))
+    speed_sd = np.sqrt(np.einsum("kii->ki", found.trajectory.covariance)[:, 6:].max(axis=1))
+    assert speed_sd[truth.rest].max() < 0.011
+    assert speed_sd[~truth.rest].max() > 1.5 * np.median(speed_sd[truth.rest])
+    eigenvalues = np.linalg.eigvalsh(found.trajectory.covariance[:: len(truth.rest) // 20])
+    assert eigenvalues.min() > -1e-12
+
+
+def test_missing_samples_carry_no_weight_and_one_sentence_says_so():
+    recording, truth = walk(4)
+    lost = np.zeros((len(recording), 6), bool)
+    moving = np.flatnonzero(~truth.rest)[20:23]
+    lost[moving] = True
+    signal = recording.signal
+    signal[moving] = 0.5 * (signal[moving[0] - 1] + signal[moving[-1] + 1])
+    gappy = eqx.tree_at(lambda r: r.missing, recording.with_signal(signal), lost)
+    found = estimate(gappy, load_config(None, method="standard"))
+    assert any("missing" in warning for warning in found.warnings)
+    assert position_rmse(found.trajectory.position, truth.position) < 0.05
+
+
+def test_no_rest_at_the_start_is_one_sentence():
+    recording, _ = walk(4)
+    rest = recording.rest.copy()
+    rest[:150] = False
+    with pytest.raises(InputError, match="no rest at the start") as caught:
+        estimate(eqx.tree_at(lambda r: r.rest, recording, rest))
+    assert "\n" not in str(caught.value)
