@@ -200,7 +200,7 @@ def smooth_nonnegative(
     prior: NavState,
     prior_covariance: Float[Array, "9 9"],
     gravity: Float[Array, ""],
-    relinearisations: int = 1,
+    relinearisations: Int[Array, ""] | int = 1,
     max_iterations: int = 50,
     tolerance: float = 1e-9,
 ) -> tuple[Smoothed, ActiveSet]:

@@ -122,7 +122,7 @@ def compensate_parallel(
     that its bounds leave: departures know how uncertain their tilt is, and one bad fill does not bend what
     follows. In the first pass δ is 0 and the variance is the second moment about it.
     """
-    busy = np.unique(layout.gap_segment)
+    busy = np.unique(layout.gap_segment).tolist()
     fills = Fills.nothing(trial, len(layout.segments))
     table = arrival_table(trial, layout)
     count = 0
@@ -142,7 +142,7 @@ def compensate_parallel(
         states, covariances = jax.tree.map(np.asarray, (states, covariances))
         for i in busy:
             at = max(0, int(layout.segments.departure[i]))
-            state = NavState(states.q_nb[at], states.velocity[at], states.position[at])
+            state = jax.tree.map(lambda x, at=at: x[at], states)
             segment = gather(trial, layout, i, state, covariances[at], table[i])
             _record(fills, trial, layout, i, _solve(segment, trial.gravity, options))
             count += 1
@@ -158,7 +158,7 @@ def compensate_sequential(
     segments = layout.segments
     fills = Fills.nothing(trial, len(segments))
     table = arrival_table(trial, layout)
-    busy = np.unique(layout.gap_segment)
+    busy = np.unique(layout.gap_segment).tolist()
     state, covariance, at = trial.prior, trial.prior_covariance, 0
     for count, index in enumerate(busy):
         departure = max(0, int(segments.departure[index]))

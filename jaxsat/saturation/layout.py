@@ -52,12 +52,12 @@ class Layout(eqx.Module):
 
     def gaps_of(self, segment: int) -> slice:
         """The gaps of a segment."""
-        return slice(*np.searchsorted(self.gap_segment, (segment, segment + 1)))
+        return slice(*np.searchsorted(self.gap_segment, (segment, segment + 1)).tolist())
 
     def values_of(self, segment: int) -> slice:
         """The saturated values of a segment."""
         gaps = self.gaps_of(segment)
-        return slice(*np.searchsorted(self.gap, (gaps.start, gaps.stop)))
+        return slice(*np.searchsorted(self.gap, (gaps.start, gaps.stop)).tolist())
 
     @staticmethod
     def of(trial: Trial, segments: Segments, gaps: Gaps) -> "Layout":
@@ -128,7 +128,8 @@ def gather(
     arrival: Float[np.ndarray, "10 10"],
 ) -> Segment:
     """One segment as a padded `Segment`; departure and arrival come from the whole recording."""
-    start, stop = max(0, layout.segments.departure[index]), layout.segments.arrival[index]
+    start = max(0, int(layout.segments.departure[index]))
+    stop = int(layout.segments.arrival[index])
     n = bucket(stop - start, 256)
     gaps, values = layout.gaps_of(index), layout.values_of(index)
     channel, sample = layout.channel[values], layout.sample[values]
