@@ -111,19 +111,12 @@ def test_padding_changes_nothing():
     np.testing.assert_allclose(F(DELTA, longer), F(DELTA, segment), rtol=1e-12)
 
 
-def test_gauss_newton_factors_give_the_hessian_where_the_fit_is_good():
-    """At zero residual second derivatives of the model vanish from the Hessian."""
-    segment = build(False)
-    far = condense(segment)
-    rows, weight = arrival_sensitivity(DELTA, far, problems.GRAVITY)
-    assert rows.shape == (8, 6) and not rows[6:].any()
-    hessian = jax.hessian(lambda d: objective(d, far, problems.GRAVITY))
-    # Take the curvature of ½ eᵀ M e along the measured sensitivity of the arrival itself.
-    gauss_newton = rows @ weight @ rows.T
-    assert np.linalg.matrix_rank(gauss_newton, tol=1e-6 * np.linalg.norm(gauss_newton)) <= 6
-    curvature = hessian(DELTA)
-    residual_share = np.linalg.norm(curvature - gauss_newton) / np.linalg.norm(gauss_newton)
-    assert np.isfinite(residual_share)
+def test_one_arrival_tells_at_most_six_things_about_many_values():
+    rows, weight = arrival_sensitivity(DELTA, condense(build(False)), problems.GRAVITY)
+    assert not rows[6:].any() and rows[:6].any(axis=1).all()
+    assert np.linalg.eigvalsh(weight).min() > -1e-9 * np.linalg.norm(weight)
+    # Heading cannot be seen from a rest: the weight has no part along gravity, so five things remain.
+    assert np.linalg.matrix_rank(weight, tol=1e-9 * np.linalg.norm(weight)) == 5
 
 
 def test_no_rest_after_means_no_information():
