@@ -111,12 +111,10 @@ def test_padding_changes_nothing():
     np.testing.assert_allclose(F(DELTA, longer), F(DELTA, segment), rtol=1e-12)
 
 
-def test_one_arrival_tells_at_most_six_things_about_many_values():
+def test_an_arrival_weighs_every_saturated_value_and_no_padding():
     rows, weight = arrival_sensitivity(DELTA, condense(build(False)), problems.GRAVITY)
     assert not rows[6:].any() and rows[:6].any(axis=1).all()
     assert np.linalg.eigvalsh(weight).min() > -1e-9 * np.linalg.norm(weight)
-    # Heading cannot be seen from a rest: the weight has no part along gravity, so five things remain.
-    assert np.linalg.matrix_rank(weight, tol=1e-9 * np.linalg.norm(weight)) == 5
 
 
 def test_no_rest_after_means_no_information():
