@@ -97,8 +97,10 @@ def test_objective_does_not_depend_on_heading_or_position():
 
 def test_padding_changes_nothing():
     segment = build(False)
-    longer = jax.tree.map(lambda x: x, segment)
-    pad = lambda x: jnp.concatenate([x, jnp.zeros((64, *x.shape[1:]))])  # noqa: E731
+
+    def pad(x):
+        return jnp.concatenate([x, jnp.zeros((64, *x.shape[1:]))])
+
     longer = Segment(
         **{
             **{f: getattr(segment, f) for f in segment.__dataclass_fields__},

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -22,10 +21,10 @@ Progress = Callable[[int, int], None]
 class Options(eqx.Module):
     """How the search runs; see `jaxsat.config.Saturation`."""
 
-    method: Compensation = eqx.field(static=True, default="direct")
-    free_peak_time: bool = eqx.field(static=True, default=False)
-    max_iterations: int = eqx.field(static=True, default=500)
-    tolerance: float | Float[Array, ""] = 1e-3
+    method: Compensation = eqx.field(static=True)
+    free_peak_time: bool = eqx.field(static=True)
+    max_iterations: int = eqx.field(static=True)
+    tolerance: Float[Array, ""]
 
 
 class Fills(eqx.Module):
@@ -70,7 +69,7 @@ def _solve(segment: Segment, gravity, options: Options) -> SegmentFill:
     return solve_segment(
         segment,
         gravity,
-        jnp.asarray(options.tolerance),
+        options.tolerance,
         options.method,
         options.free_peak_time,
         options.max_iterations,
