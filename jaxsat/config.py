@@ -59,6 +59,9 @@ class Saturation(_Section):
     free_peak_time: bool = Field(
         default=False, description="search the peak time of a triangle or parabola too"
     )
+    solver: Literal["gauss_newton", "projected_gradient"] = Field(
+        default="gauss_newton", description="gauss_newton or projected_gradient"
+    )
     tolerance: float = Field(
         default=1e-2, gt=0, description="largest accepted optimality residual (scaled, per variable)"
     )

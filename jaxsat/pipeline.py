@@ -15,8 +15,9 @@ from jaxsat.errors import InputError
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
 from jaxsat.inertial.smoother import ActiveSet, Rows, Smoothed, smooth, smooth_nonnegative
 from jaxsat.inertial.strapdown import NavState, Samples, prefixes, sample_intervals
-from jaxsat.saturation.compensate import Fills, Options, compensate_parallel, compensate_sequential
-from jaxsat.saturation.layout import Layout, Trial
+from jaxsat.saturation.compensate import Fills, compensate_parallel, compensate_sequential
+from jaxsat.saturation.layout import Trial
+from jaxsat.saturation.methods import Options
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording
@@ -94,8 +95,23 @@ def estimate(
         return _estimate(recording, config, progress or (lambda *_: None))
 
 
-def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
-    clock = _Clock()
+class Prepared(eqx.Module):
+    """A recording with its rests, rails and gaps found, ready for the smoother."""
+
+    trial: Trial
+    """Padded."""
+    gyr_offset: Float[np.ndarray, "3"]
+    """What was taken off the rates (rad/s)."""
+    rails: Rails
+    rest: Bool[np.ndarray, "N"]
+    segments: Segments
+    gaps: Gaps
+    sign: Int[np.ndarray, "N 6"]
+    warnings: list[str] = eqx.field(static=True)
+
+
+def prepare(recording: Recording, config: Config) -> Prepared:
+    """All that is done to a recording before it is smoothed; raises `InputError` as `estimate` does."""
     warnings = check(recording)
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
     saturated, sign = saturation_mask(recording, rails)
@@ -109,11 +125,27 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         at_rail,
     )
     rest = rest & ~at_rail & ~recording.missing.all(axis=1)
-    segments, gaps = find_segments(rest), find_gaps(sign)
-    clock.lap("signals")
-
     trial, offset = _trial(recording, config, rest, sign)
-    layout = Layout.of(trial, segments, gaps)
+    return Prepared(trial, offset, rails, rest, find_segments(rest), find_gaps(sign), sign, warnings)
+
+
+def search_options(config: Config, method: str) -> Options:
+    """How a compensating method searches."""
+    chosen = config.saturation
+    return Options(
+        method,
+        chosen.solver,
+        chosen.free_peak_time,
+        jnp.asarray(chosen.max_iterations),
+        jnp.asarray(chosen.tolerance),
+    )
+
+
+def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
+    clock = _Clock()
+    prepared = prepare(recording, config)
+    trial, segments, gaps = prepared.trial, prepared.segments, prepared.gaps
+    clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))
     standard, floor = _smooth(trial, config)
     smoothed = standard
@@ -121,21 +153,18 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     compensated = False
     if config.method != "standard" and len(gaps):
         compensated = True
-        options = Options(
-            config.method,
-            config.saturation.free_peak_time,
-            config.saturation.max_iterations,
-            jnp.asarray(config.saturation.tolerance),
-        )
+        options = search_options(config, config.method)
         report = partial(progress, "segments")
         # An inequality acts on the whole trajectory only: a single segment is searched without it.
         searched = trial
         if config.height.mode == "nonnegative":
-            searched = eqx.tree_at(lambda t: t.rows.height, trial, jnp.zeros(len(rest), bool))
+            searched = eqx.tree_at(
+                lambda t: (t.rows.height, t.heights), trial, (np.zeros(len(trial.period), bool), False)
+            )
         if config.saturation.segments == "parallel":
-            fills = compensate_parallel(searched, layout, options, config.saturation.sweeps, report)
+            fills = compensate_parallel(searched, segments, options, config.saturation.sweeps, report)
         else:
-            fills = compensate_sequential(searched, layout, options, report)
+            fills = compensate_sequential(searched, segments, options, report)
         clock.lap("compensation")
         # A filled value is known to lie within its bounds, no better.
         filled = eqx.tree_at(
@@ -145,8 +174,12 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         clock.lap("smoother")
 
     n = len(recording)
-    offsets = np.concatenate([offset, np.zeros(3)])
-    filled = np.where(sign != 0, fills.signal + offsets, recording.signal)
+    fills = eqx.tree_at(lambda f: (f.signal, f.at_bound), fills, (fills.signal[:n], fills.at_bound[:n]))
+    if floor is not None:
+        floor = eqx.tree_at(lambda f: f.active, floor, floor.active[:n])
+    offsets = np.concatenate([prepared.gyr_offset, np.zeros(3)])
+    filled = np.where(prepared.sign != 0, fills.signal + offsets, recording.signal)
+    variance = trial.variance + (trial.fill_variance if compensated else 0.0)
     return Estimate(
         recording=recording,
         config=config,
@@ -157,21 +190,21 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
             velocity=np.asarray(smoothed.state.velocity)[:n],
             covariance=np.asarray(smoothed.covariance)[:n],
         ),
-        rails=rails,
-        rest=rest,
+        rails=prepared.rails,
+        rest=prepared.rest,
         segments=segments,
         gaps=gaps,
-        sign=sign,
+        sign=prepared.sign,
         filled=filled,
-        signal_sd=np.sqrt(trial.variance + (trial.fill_variance if compensated else 0.0)),
+        signal_sd=np.sqrt(variance)[:n],
         fills=fills,
         standard_position=np.asarray(standard.state.position)[:n],
         cost=np.asarray(smoothed.cost),
         cost_standard=np.asarray(standard.cost),
         gravity=float(trial.gravity),
-        gyr_offset=offset,
+        gyr_offset=prepared.gyr_offset,
         floor=floor,
-        warnings=warnings,
+        warnings=prepared.warnings,
         seconds=clock.seconds,
     )
 
@@ -252,8 +285,9 @@ def _trial(
         prior=jax.tree.map(np.asarray, NavState(q_nb, velocity, jnp.zeros(3))),
         prior_covariance=prior_covariance,
         gravity=np.asarray(gravity),
+        heights=config.height.mode != "off",
     )
-    return trial, offset
+    return trial.padded(), offset
 
 
 def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:

@@ -56,5 +56,5 @@ def test_edge_slope_is_exact_for_parabolas():
         return 2.0 + 3.0 * t - 0.7 * t**2
 
     t = np.array([4.0, 5.0, 6.0])
-    np.testing.assert_allclose(edge_slope(*f(t)[:, None]), 3.0 - 1.4 * 4.0)
-    np.testing.assert_allclose(-edge_slope(*f(t[::-1])[:, None]), 3.0 - 1.4 * 6.0)
+    np.testing.assert_allclose(edge_slope(*jnp.asarray(f(t)[:, None])), 3.0 - 1.4 * 4.0)
+    np.testing.assert_allclose(-edge_slope(*jnp.asarray(f(t[::-1])[:, None])), 3.0 - 1.4 * 6.0)

@@ -6,10 +6,12 @@ import numpy as np
 import problems
 import pytest
 
-from jaxsat.inertial.smoother import smooth_about
-from jaxsat.inertial.strapdown import NavState, Samples, add_error, strapdown
+from jaxsat.inertial.rotations import quat_conjugate, quat_to_matrix
+from jaxsat.inertial.smoother import closed_loop, smooth_about
+from jaxsat.inertial.strapdown import NavState, Samples, add_error, error_between, strapdown
+from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.gap_shapes import Edges
-from jaxsat.saturation.segment import Segment, arrival_sensitivity, arrivals, condense, objective
+from jaxsat.saturation.segment import Segment, condense, objective, value_gradient_root
 
 MOVING, RESTING = 64, 40
 N = MOVING + RESTING
@@ -41,7 +43,7 @@ def build(height: bool, departure=None) -> Segment:
         departure=state,
         departure_covariance=covariance,
         arrival=arrival_table()[0],
-        height=jnp.asarray(height),
+        height=jnp.asarray(True) if height else None,
         height_variance=jnp.asarray(4e-4),
     )
 
@@ -113,10 +115,34 @@ def test_padding_changes_nothing():
     np.testing.assert_allclose(F(DELTA, longer), F(DELTA, segment), rtol=1e-12)
 
 
-def test_an_arrival_weighs_every_saturated_value_and_no_padding():
-    rows, weight = arrival_sensitivity(DELTA, condense(build(False)), problems.GRAVITY)
-    assert not rows[6:].any() and rows[:6].any(axis=1).all()
-    assert np.linalg.eigvalsh(weight).min() > -1e-9 * np.linalg.norm(weight)
+def test_gauss_newton_factor_is_the_sensitivity_of_the_arrival_in_the_metric_of_the_data():
+    """A Aᵀ against derivatives of the strapdown, and the weight of the data by dense inverses."""
+    segment = build(False)
+    state, covariance = problems.departure()
+    sample = jnp.asarray(CUT)[segment.element[:6]]
+
+    def moved(delta):
+        signal = SAMPLES.signal.at[sample, segment.channel[:6]].add(segment.sign[:6] * delta)
+        path = strapdown(signal[:MOVING], SAMPLES.period[:MOVING], state, problems.GRAVITY)
+        return jax.tree.map(lambda x: x[-1], path)
+
+    end = moved(DELTA[:6])
+    J = jax.jacfwd(lambda delta: error_between(moved(delta), end))(DELTA[:6])[np.array([0, 1, 2, 6, 7, 8])]
+    # The covariance on arrival, by the filter.
+    signal = SAMPLES.signal.at[sample, segment.channel[:6]].add(segment.sign[:6] * DELTA[:6])
+    samples = jax.tree.map(lambda x: x[:MOVING], Samples(signal, SAMPLES.period, SAMPLES.variance))
+    nowhere = problems.rows(np.zeros(MOVING, bool))
+    _, P = closed_loop(samples, nowhere, state, covariance, problems.GRAVITY)
+    P = P[-1][np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])]
+    R = quat_to_matrix(quat_conjugate(end.q_nb))
+    D = np.kron(np.eye(2), R)
+    information = np.asarray(segment.arrival)[:6, :6]
+    weight = information @ np.linalg.inv(np.eye(6) + D @ P @ D.T @ information)
+    expected = J.T @ D.T @ weight @ D @ J
+    _, _, columns = value_gradient_root(DELTA, condense(segment), problems.GRAVITY)
+    A = np.stack(columns, axis=1)
+    assert not A[6:].any() and A[:6].any(axis=1).all(), "every saturated value counts, and no padding"
+    np.testing.assert_allclose(A[:6] @ A[:6].T, expected, atol=2e-3 * np.abs(expected).max())
 
 
 def test_no_rest_after_means_no_information():

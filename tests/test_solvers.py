@@ -1,4 +1,4 @@
-"""Projected gradient on bounded quadratics with a known answer."""
+"""Both solvers on bounded problems with a known answer."""
 
 import jax
 import jax.numpy as jnp
@@ -6,72 +6,95 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from jaxsat.saturation.solvers import Status, projected_gradient
+from jaxsat.saturation.solvers import Status, box_step, projected_gauss_newton, projected_gradient
 
 RNG = np.random.default_rng(4)
-A = RNG.normal(size=(12, 8)) * np.geomspace(1.0, 30.0, 8)
-B = RNG.normal(size=12) * 20.0
+A = RNG.normal(size=(6, 8)) * np.geomspace(1.0, 30.0, 8)
+B = RNG.normal(size=6) * 20.0
 UPPER = np.geomspace(2.0, 0.05, 8)
-EXACT = lsq_linear(A, B, (np.zeros(8), UPPER), tol=1e-12).x
-
-
-@jax.jit
-def solve(scale, stretch, max_iterations=2000):
-    """The same problem in variables that are `stretch` times smaller."""
-
-    def fun(x):
-        return 0.5 * jnp.sum((jnp.asarray(A) @ (x * stretch) - jnp.asarray(B)) ** 2)
-
-    return projected_gradient(
-        fun,
-        jnp.zeros(8),
-        jnp.zeros(8),
-        jnp.asarray(UPPER) / stretch,
-        scale / stretch,
-        jnp.asarray(1e-6),
-        max_iterations,
-    )
-
-
+OPTIMUM = lsq_linear(A, B, (np.zeros(8), UPPER), tol=1e-12)
 SCALE = jnp.asarray(1.0 / np.sqrt(np.sum(A**2, axis=0)))
+both = pytest.mark.parametrize("solver", [projected_gradient, projected_gauss_newton])
 
 
-def test_finds_the_bounded_minimum_and_proves_it():
-    found = solve(SCALE, jnp.ones(8))
-    assert found.status == Status.CONVERGED and found.residual <= 1e-6
-    np.testing.assert_allclose(found.x, EXACT, atol=1e-6)
-    assert (EXACT == 0).any() or (np.isclose(EXACT, UPPER)).any(), "a bound is active in this problem"
+def least_squares(residual):
+    """A problem as the solvers want it: value, gradient, and columns of the Gauss-Newton factor."""
+
+    def linearise(x):
+        r, J = residual(x), jax.jacfwd(residual)(x)
+        return 0.5 * jnp.sum(r**2), J.T @ r, tuple(J)
+
+    return linearise
 
 
-def test_scaled_variables_make_the_result_independent_of_units():
-    """Curvatures of 1e6 and more in raw variables: jaxopt alone stops far from the optimum there."""
-    found = solve(SCALE, jnp.ones(8))
-    other = solve(SCALE, jnp.geomspace(1e-4, 1e4, 8))
-    np.testing.assert_allclose(other.x * jnp.geomspace(1e-4, 1e4, 8), found.x, atol=1e-8)
+def solve(solver, upper=UPPER, stretch=1.0, tolerance=1e-7, max_iterations=4000):
+    """The same problem in variables that are `stretch` times smaller."""
+    stretch = jnp.asarray(np.broadcast_to(stretch, 8))
+    fun = least_squares(lambda x: jnp.asarray(A) @ (x * stretch) - jnp.asarray(B))
+    limits = jnp.zeros(8), jnp.zeros(8), jnp.asarray(upper) / stretch
+    return jax.jit(lambda: solver(fun, *limits, SCALE / stretch, jnp.asarray(tolerance), max_iterations))()
 
 
-def test_running_out_of_iterations_is_said():
-    def rosenbrock(x):
-        return 100.0 * (x[1] - x[0] ** 2) ** 2 + (1.0 - x[0]) ** 2
-
-    found = projected_gradient(
-        rosenbrock,
-        jnp.array([0.1, 0.9]),
-        jnp.zeros(2),
-        jnp.full(2, 2.0),
-        jnp.full(2, 0.1),
-        jnp.asarray(1e-9),
-        1,
+@both
+def test_finds_the_bounded_minimum_and_proves_it(solver):
+    found = solve(solver)
+    assert found.status == Status.CONVERGED and found.residual <= 1e-7
+    assert np.isclose(OPTIMUM.x, 0, atol=1e-9).any() or np.isclose(OPTIMUM.x, UPPER).any(), (
+        "a bound is active"
     )
+    np.testing.assert_allclose(found.value, OPTIMUM.cost, rtol=1e-8)
+    assert (found.x >= 0.0).all() and (found.x <= UPPER * (1 + 1e-12)).all()
+
+
+@both
+def test_scaled_variables_make_the_result_independent_of_units(solver):
+    """Curvatures of 1e6 and more in raw variables: jaxopt alone stops far from the optimum there."""
+    stretch = np.geomspace(1e-4, 1e4, 8)
+    np.testing.assert_allclose(solve(solver, stretch=stretch).x * stretch, solve(solver).x, atol=1e-7)
+
+
+@both
+def test_running_out_of_iterations_is_said(solver):
+    rosenbrock = least_squares(lambda x: jnp.stack([14.0 * (x[1] - x[0] ** 2), 1.4 * (1.0 - x[0])]))
+    start, lower, upper = jnp.array([0.1, 0.9]), jnp.zeros(2), jnp.full(2, 2.0)
+    found = solver(rosenbrock, start, lower, upper, jnp.full(2, 0.1), jnp.asarray(1e-9), 1)
     assert found.status == Status.MAX_ITERATIONS and found.residual > 1e-9
+    later = solver(rosenbrock, start, lower, upper, jnp.full(2, 0.1), jnp.asarray(1e-6), 3000)
+    assert later.status == Status.CONVERGED
+    np.testing.assert_allclose(later.x, 1.0, atol=1e-4)
 
 
+@both
 @pytest.mark.parametrize("held", [0, 5])
-def test_a_variable_without_range_stays_where_it_is(held):
-    upper = jnp.asarray(UPPER).at[held].set(0.0)
-
-    def fun(x):
-        return 0.5 * jnp.sum((jnp.asarray(A) @ x - jnp.asarray(B)) ** 2)
-
-    found = projected_gradient(fun, jnp.zeros(8), jnp.zeros(8), upper, SCALE, jnp.asarray(1e-6), 2000)
+def test_a_variable_without_range_stays_where_it_is(solver, held):
+    upper = UPPER.copy()
+    upper[held] = 0.0
+    found = solve(solver, upper)
     assert found.x[held] == 0.0 and found.status == Status.CONVERGED
+
+
+def test_gauss_newton_takes_the_shortest_of_the_steps_that_the_data_cannot_tell_apart():
+    wide = np.full(8, 1e3)
+    fun = least_squares(lambda x: jnp.asarray(A[:3]) @ x - jnp.asarray(A[:3] @ np.ones(8)))
+    start = jnp.zeros(8), jnp.full(8, -1e3), jnp.asarray(wide)
+    found = projected_gauss_newton(fun, *start, jnp.ones(8), jnp.asarray(1e-8), 200)
+    np.testing.assert_allclose(found.x, np.linalg.pinv(A[:3]) @ A[:3] @ np.ones(8), atol=1e-6)
+
+
+@pytest.mark.parametrize("damping", [1e-6, 1e-2, 10.0])
+def test_box_step_is_the_solution_of_the_bounded_quadratic_problem(damping):
+    gradient = A.T @ B
+    low, high = -UPPER / 3.0, 2.0 * UPPER / 3.0
+    d = box_step(
+        jnp.asarray(gradient),
+        tuple(jnp.asarray(A)),
+        jnp.asarray(damping),
+        jnp.asarray(low),
+        jnp.asarray(high),
+    )
+    slope = gradient + A.T @ (A @ d) + damping * np.asarray(d)
+    free = (d > low + 1e-12) & (d < high - 1e-12)
+    np.testing.assert_allclose(slope[free], 0.0, atol=1e-6 * np.abs(gradient).max())
+    assert (slope[np.asarray(d) <= low + 1e-12] >= 0).all() and (
+        slope[np.asarray(d) >= high - 1e-12] <= 0
+    ).all()

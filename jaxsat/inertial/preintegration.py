@@ -1,147 +1,307 @@
-"""Many samples as few intervals, by sums over prefixes instead of composing one by one."""
+"""Many samples as few stretches, with the noise they carry: motion that no state and no row interrupts.
+
+An error of one sample reaches the end of a motion through its levers: V and, where heights matter, W of what
+follows it, in the body frame at the start. A rate that is off by ε turns θ by b = [I; −[V×]; −[W×]] Tε, a specific
+force moves v and r by T and T(½T + τ). Noise that is the same on all axes of a sensor therefore needs no more
+than sums of levers and of their products.
+"""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from jaxsat.inertial.rotations import quat_exp, quat_multiply, quat_rotate
-from jaxsat.inertial.strapdown import (
-    Interval,
-    Moments,
-    between,
-    compose,
-    prefixes,
-    sample_intervals,
-    shift_moments,
-)
+from jaxsat.inertial.components import Matrix, Quaternion, Scalar, Vector
+
+_STILL = Quaternion(1.0, 0.0, 0.0, 0.0)
+
+Levers = tuple[Vector, ...]
+"""(V,) or (V, W): first and second integral of the specific force, seen from the start (m/s, m)."""
 
 
-def remainders(upto: Interval) -> Interval:
-    """What follows each of N intervals until the end of all, in the body frame at the start of all.
+class SensorNoise(eqx.Module):
+    """Sums over the samples of a stretch, with c = variance · T² of the gyroscope and a that of the accelerometer."""
 
-    upto: their `prefixes`. Row j holds V, W and τ of what comes after j; its rotation is the attitude there.
+    weight: Scalar
+    """Σ c."""
+    first: tuple[Vector, ...]
+    """Σ c h of each lever h."""
+    second: tuple[tuple[Matrix, ...], ...]
+    """Σ c h h'ᵀ of each pair of levers."""
+    force: tuple[tuple[Scalar, ...], ...]
+    """Σ a s s' with s = 1 for the velocity and ½T + τ for the position."""
+
+    def __add__(self, other: "SensorNoise") -> "SensorNoise":
+        return jax.tree.map(jnp.add, self, other)
+
+    def sum(self) -> "SensorNoise":
+        """Of all stretches (leading axis)."""
+        return jax.tree.map(lambda x: jnp.sum(x, axis=0), self)
+
+    def covariance(self) -> Matrix:
+        """Of [θ, v] or [θ, v, r] at the end, in the frame of the start; [x×][y×]ᵀ = (x·y)I − y xᵀ."""
+        lifts = [-Matrix.skew(h) for h in self.first]
+        rows = [[Matrix.identity(3, self.weight), *(lift.T for lift in lifts)]]
+        for i, lift in enumerate(lifts):
+            blocks = [
+                Matrix.identity(3, self.second[i][j].trace() + self.force[i][j]) - self.second[j][i]
+                for j in range(len(lifts))
+            ]
+            rows.append([lift, *blocks])
+        return Matrix.block(rows)
+
+    def along(self, turn: Vector, pull: Levers) -> Scalar:
+        """Σ over the gyroscope's errors of c |t + Σ_h h × p_h|², and of the accelerometer's of a |Σ s_h p_h|².
+
+        With t and p the multipliers of θ and of each lever this is λᵀ·covariance·λ, for less.
+        """
+        turned = _total(h.cross(p) for h, p in zip(self.first, pull, strict=True))
+        value = self.weight * turn.dot(turn) + 2.0 * turn.dot(turned)
+        for i, p in enumerate(pull):
+            for j, q in enumerate(pull):
+                block = self.second[i][j]
+                value = value + (block.trace() + self.force[i][j]) * p.dot(q) - q.dot(block(p))
+        return value
+
+
+def _total(vectors) -> Vector:
+    first, *others = vectors
+    for other in others:
+        first = first + other
+    return first
+
+
+def sample_noise(levers: Levers, duration: Scalar, period: Scalar, variance: tuple[Scalar, Scalar]):
+    """Noise of a single sample; levers, duration: of what follows it."""
+    c, a = (v * period**2 for v in variance)
+    s = (jnp.ones_like(period), 0.5 * period + duration)[: len(levers)]
+    return SensorNoise(
+        weight=c,
+        first=tuple(h * c for h in levers),
+        second=_symmetric([[(h * c).outer(k) for k in levers] for h in levers]),
+        force=tuple(tuple(a * x * y for y in s) for x in s),
+    )
+
+
+def followed(noise: SensorNoise, attitude: Quaternion | None, later: Levers, duration: Scalar) -> SensorNoise:
+    """The noise of a stretch that starts at an attitude and has `later` behind it, in the frame of that attitude.
+
+    attitude: None for none.
     """
-    total = jax.tree.map(lambda x: x[-1:], upto)
-    duration = total.duration - upto.duration
-    return Interval(
-        rotation=upto.rotation,
-        velocity=total.velocity - upto.velocity,
-        position=total.position - upto.position - upto.velocity * duration[:, None],
-        duration=duration,
+    first, second, force = list(noise.first), [list(row) for row in noise.second], noise.force
+    if len(later) == 2:
+        # Time carries each velocity lever on into the position lever.
+        first[1] = first[1] + first[0] * duration
+        second[0][1] = second[0][1] + second[0][0] * duration
+        second[1][0] = second[1][0] + second[0][0] * duration
+        second[1][1] = second[1][1] + noise.second[1][0] * duration + second[0][1] * duration
+        cross = force[0][1] + force[0][0] * duration
+        square = force[1][1] + (force[0][1] + cross) * duration
+        force = ((force[0][0], cross), (cross, square))
+    if attitude is not None:
+        R = attitude.matrix()
+        first = [R(h) for h in first]
+        second = [[R @ block @ R.T for block in row] for row in second]
+    n = noise.weight
+    for i, row in enumerate(second):
+        for j, block in enumerate(row):
+            row[j] = block + first[i].outer(later[j]) + later[i].outer(first[j] + later[j] * n)
+    return SensorNoise(
+        weight=n,
+        first=tuple(h + add * n for h, add in zip(first, later, strict=True)),
+        second=_symmetric(second),
+        force=force,
     )
 
 
-def noise_sources(after: Interval, period: Float[Array, "N"], variance: Float[Array, "N 2"]):
-    """√c h (N, 7) and √a s (N, 2) of `Moments` for samples that `after` follows."""
-    root = jnp.sqrt(variance) * period[:, None]
-    one = jnp.ones_like(period)[:, None]
-    h = jnp.concatenate([after.position, after.velocity, one], axis=1) * root[:, :1]
-    s = jnp.concatenate([0.5 * period[:, None] + after.duration[:, None], one], axis=1) * root[:, 1:]
-    return h, s
+def _symmetric(second: list[list[Matrix]]) -> tuple[tuple[Matrix, ...], ...]:
+    """Sums of h h'ᵀ from those on and above the diagonal."""
+    if len(second) == 1:
+        return ((second[0][0].mirrored(),),)
+    cross = second[0][1]
+    return (second[0][0].mirrored(), cross), (cross.T, second[1][1].mirrored())
 
 
-def collapse(
-    signal: Float[Array, "N 6"], period: Float[Array, "N"], variance: Float[Array, "N 2"]
-) -> Interval:
-    """N samples as one interval with its noise."""
-    upto = prefixes(sample_intervals(signal, period))
-    h, s = noise_sources(remainders(upto), period, variance)
-    total = jax.tree.map(lambda x: x[-1], upto)
-    return eqx.tree_at(
-        lambda i: i.noise, total, Moments(gyr=h.T @ h, acc=s.T @ s), is_leaf=lambda x: x is None
-    )
+class Stretch(eqx.Module):
+    """Samples between two that are looked at one by one."""
+
+    rotation: Quaternion
+    levers: Levers
+    duration: Scalar
+    noise: SensorNoise
+
+    @staticmethod
+    def empty(position: bool, like: Scalar) -> "Stretch":
+        """No sample; position: carry W too."""
+        zero, one = jnp.zeros_like(like), jnp.ones_like(like)
+        still = Vector(zero, zero, zero)
+        levers = (still, still) if position else (still,)
+        return Stretch(
+            Quaternion(one, zero, zero, zero), levers, zero, sample_noise(levers, zero, zero, (zero, zero))
+        )
+
+    def then(self, gyr: Vector, acc: Vector, period: Scalar, variance: tuple[Scalar, Scalar]) -> "Stretch":
+        """With one more sample behind it."""
+        half = Quaternion.exp(gyr * (0.5 * period))
+        pushed = (self.rotation @ half).rotate(acc) * period
+        later = (pushed, pushed * (0.5 * period))[: len(self.levers)]
+        nothing = Stretch.empty(len(later) == 2, period)
+        moved = (
+            self.levers[0] + pushed,
+            *(W + self.levers[0] * period + later[1] for W in self.levers[1:]),
+        )
+        return Stretch(
+            rotation=self.rotation @ (half @ half),
+            levers=moved,
+            duration=self.duration + period,
+            noise=followed(self.noise, None, later, period)
+            + sample_noise(nothing.levers, nothing.duration, period, variance),
+        )
 
 
 def stretches(
     signal: Float[Array, "N 6"],
     period: Float[Array, "N"],
     variance: Float[Array, "N 2"],
-    cut: Int[Array, "M"],
-) -> tuple[Interval, Moments]:
-    """The M+1 stretches between the samples `cut` (ascending; N pads), which belong to none of them."""
-    count = len(period)
-    upto = prefixes(sample_intervals(signal, period))
-    edges = jax.tree.map(lambda x: jnp.concatenate([jnp.zeros_like(x[:1]), x]), upto)
-    edges = eqx.tree_at(lambda i: i.rotation, edges, edges.rotation.at[0, 0].set(1.0))
-    begin = jnp.concatenate([jnp.zeros(1, cut.dtype), jnp.minimum(cut + 1, count)])
-    end = jnp.concatenate([cut, jnp.full(1, count, cut.dtype)])
-    first, last = (jax.tree.map(lambda x, at=at: x[at], edges) for at in (begin, end))
-    inner = jax.vmap(between)(first, last)
+    cut: Bool[Array, "N"],
+    position: bool,
+) -> tuple[Stretch, Stretch]:
+    """What lies between the cut samples, which belong to no stretch.
 
-    # Which stretch a sample lies in; a cut sample counts for none. What follows it there, from its frame.
-    sample = jnp.arange(count, dtype=cut.dtype)
-    mine = jnp.searchsorted(cut, sample).astype(cut.dtype)
-    one_hot = (mine[:, None] == jnp.arange(len(cut) + 1, dtype=cut.dtype)[None, :]) & (
-        sample[:, None] < end[None, :]
-    )
-    here = jax.tree.map(lambda x: x[mine], (first, last))
-    until = jax.vmap(between)(here[0], jax.tree.map(lambda x: x[1:], edges))
-    whole = jax.vmap(between)(*here)
-    left = whole.duration - until.duration
-    after = Interval(
-        rotation=until.rotation,
-        velocity=whole.velocity - until.velocity,
-        position=whole.position - until.position - until.velocity * left[:, None],
-        duration=left,
-    )
-    h, s = noise_sources(after, period, variance)
-    weight = one_hot.astype(h.dtype)
-    noise = Moments(
-        gyr=jnp.einsum("km,ki,kj->mij", weight, h, h), acc=jnp.einsum("km,ki,kj->mij", weight, s, s)
-    )
-    return inner, noise
-
-
-def alternate(
-    gaps: Interval,
-    noise: Moments,
-    signal: Float[Array, "M 6"],
-    period: Float[Array, "M"],
-    variance: Float[Array, "M 2"],
-) -> tuple[Interval, Moments]:
-    """M stretches, each followed by a sample: prefixes of these pairs, and the noise of all of them together."""
-    samples = sample_intervals(signal, period)
-    upto = prefixes(jax.vmap(compose)(gaps, samples))
-    after = remainders(upto)
-    h, s = noise_sources(after, period, variance)
-    # A stretch starts where the pair before it ends, and its sample follows before the rest does.
-    start = jnp.concatenate([jnp.zeros_like(upto.rotation[:1]).at[0, 0].set(1.0), upto.rotation[:-1]])
-    turned = jax.vmap(quat_rotate)(jax.vmap(quat_multiply)(start, gaps.rotation), samples.velocity)
-    moved = jax.vmap(quat_rotate)(jax.vmap(quat_multiply)(start, gaps.rotation), samples.position)
-    later = Interval(
-        rotation=after.rotation,
-        velocity=after.velocity + turned,
-        position=after.position + turned * after.duration[:, None] + moved,
-        duration=after.duration + period,
-    )
-    shifted = jax.vmap(shift_moments)(start, noise, later)
-    return upto, Moments(
-        gyr=jnp.sum(shifted.gyr, axis=0) + h.T @ h, acc=jnp.sum(shifted.acc, axis=0) + s.T @ s
-    )
-
-
-def input_effects(
-    after: Interval,
-    signal: Float[Array, "M 6"],
-    period: Float[Array, "M"],
-    element: Int[Array, "m"],
-    channel: Int[Array, "m"],
-) -> Float[Array, "m 9"]:
-    """How a unit error of single values shows at the end of all: [θ, r, v] in the body frame at the start.
-
-    after: what follows each of M samples (`remainders`); element, channel: which value. With R the attitude in
-    mid-sample, columns of T[I; −[W×]; −[V×]]R for the gyroscope and of T[0; ½T + τ; I]R for the
-    accelerometer; the half step of a rate's own sample is left out.
+    Returns, for every sample, the stretch since the last cut sample (read it at the cut ones), and the one
+    that is open at the end. Composed sample by sample: no difference of large prefixes is taken.
     """
+    empty = Stretch.empty(position, period[0])
 
-    def effect(left, values, T, axis):
-        # The attitude at the end of a sample turned back by half of it is that in its middle.
-        half = quat_multiply(left.rotation, quat_exp(-0.5 * T * values[:3]))
-        unit = quat_rotate(half, jnp.eye(3, dtype=values.dtype)[axis % 3])
-        turn = jnp.concatenate([unit, -jnp.cross(left.position, unit), -jnp.cross(left.velocity, unit)])
-        push = jnp.concatenate([jnp.zeros_like(unit), (0.5 * T + left.duration) * unit, unit])
-        return T * jnp.where(axis < 3, turn, push)
+    def step(open_, inputs):
+        gyr, acc, T, v, is_cut = inputs
+        longer = open_.then(gyr, acc, T, v)
+        return jax.tree.map(lambda e, x: jnp.where(is_cut, e, x), empty, longer), open_
 
-    left = jax.tree.map(lambda x: x[element], after)
-    return jax.vmap(effect)(left, signal[element], period[element], channel)
+    inputs = (
+        Vector.of(signal[:, :3]),
+        Vector.of(signal[:, 3:]),
+        period,
+        (variance[:, 0], variance[:, 1]),
+        cut,
+    )
+    last, before = jax.lax.scan(step, empty, inputs)
+    return before, last
+
+
+@jax.custom_jvp
+def attitude_prefixes(rotations: Quaternion) -> Quaternion:
+    """q₀⊗…⊗q_j for each j of the leading axis."""
+
+    def step(total, rotation):
+        total = total @ rotation
+        return total, total
+
+    still = jax.tree.map(lambda a, value: jnp.full_like(a[0], value), rotations, _STILL)
+    return jax.lax.scan(step, still, rotations)[1]
+
+
+@attitude_prefixes.defjvp
+def _attitude_prefixes_jvp(primals, tangents):
+    # A right turn φ_i of factor i is a left turn R_i φ_i of every product from i on, so tangents add up.
+    (rotations,), (rates,) = primals, tangents
+    totals = attitude_prefixes(rotations)
+    turned = totals.rotate((rotations.conjugate() @ rates).vector)
+    x, y, z = (jnp.cumsum(a, axis=0) for a in turned)
+    return totals, Quaternion(jnp.zeros_like(x), x, y, z) @ totals
+
+
+class Passage(eqx.Module):
+    """M stretches, each followed by a sample: the whole as seen from its start, and from each sample."""
+
+    rotation: Quaternion
+    """At the end."""
+    levers: Levers
+    duration: Scalar
+    start: Quaternion
+    """Attitude at the start of each stretch."""
+    middle: Quaternion
+    """Attitude in the middle of each sample."""
+    pushed: Vector
+    """What each sample adds to V."""
+    later: Levers
+    """Levers of what follows each stretch."""
+    after: Levers
+    """Levers of what follows each sample."""
+    left: Scalar
+    """Time that follows each sample (s)."""
+    period: Scalar
+    variance: tuple[Scalar, Scalar]
+    stretch_noise: SensorNoise
+
+    def noise_covariance(self) -> Matrix:
+        """Of [θ, v] or [θ, v, r] at the end, in the frame of the start."""
+        stretches = followed(self.stretch_noise, self.start, self.later, self.left + self.period)
+        samples = sample_noise(self.after, self.left, self.period, self.variance)
+        return (stretches + samples).sum().covariance()
+
+    def noise_along(self, turn: Vector, pull: Levers) -> Scalar:
+        """λᵀ·`noise_covariance`·λ with λ = [turn, pull…]: each error is met in its own frame, none is turned."""
+        here = _total((turn, *(h.cross(p) for h, p in zip(self.later, pull, strict=True))))
+        back = self.start.conjugate()
+        mine = list(pull)
+        if len(pull) == 2:
+            mine[0] = pull[0] + pull[1] * (self.left + self.period)
+        stretches = self.stretch_noise.along(back.rotate(here), tuple(back.rotate(p) for p in mine))
+        c, a = (v * self.period**2 for v in self.variance)
+        behind = _total((turn, *(h.cross(p) for h, p in zip(self.after, pull, strict=True))))
+        force = pull[0]
+        if len(pull) == 2:
+            force = force + pull[1] * (0.5 * self.period + self.left)
+        return jnp.sum(stretches + c * behind.dot(behind) + a * force.dot(force))
+
+
+def passage(
+    stretch: Stretch, gyr: Vector, acc: Vector, period: Float[Array, "M"], variance: tuple[Array, Array]
+) -> Passage:
+    """Join stretches (leading axis M) and the samples behind each of them; everything by running sums."""
+    half = Quaternion.exp(gyr * (0.5 * period))
+    upto = attitude_prefixes(stretch.rotation @ (half @ half))
+    start = jax.tree.map(_before, upto, _STILL)
+    middle = start @ stretch.rotation @ half
+    pushed = middle.rotate(acc) * period
+    carried = start.rotate(stretch.levers[0])
+    step = carried + pushed
+    velocity = _each(lambda a: jnp.cumsum(a, axis=0), step)
+    total = _each(lambda a: a[-1], velocity)
+    elapsed = jnp.cumsum(stretch.duration + period)
+    left = elapsed[-1] - elapsed
+    levers, after = (total,), (total - velocity,)
+    later = (after[0] + pushed,)
+    if len(stretch.levers) == 2:
+        moved = start.rotate(stretch.levers[1]) + carried * period + pushed * (0.5 * period)
+        reached = _each(
+            lambda a: jnp.cumsum(a, axis=0),
+            moved + _each(lambda a: _before(a, 0.0), velocity) * (stretch.duration + period),
+        )
+        end = _each(lambda a: a[-1], reached)
+        levers, after = (total, end), (after[0], end - reached - velocity * left)
+        later = (later[0], after[1] + pushed * (left + 0.5 * period))
+    return Passage(
+        rotation=jax.tree.map(lambda a: a[-1], upto),
+        levers=levers,
+        duration=elapsed[-1],
+        start=start,
+        middle=middle,
+        pushed=pushed,
+        later=later,
+        after=after,
+        left=left,
+        period=period,
+        variance=variance,
+        stretch_noise=stretch.noise,
+    )
+
+
+def _before(a: Array, first: float) -> Array:
+    """One step later, beginning with `first`."""
+    return jnp.concatenate([jnp.full_like(a[:1], first), a[:-1]])
+
+
+def _each(function, vector: Vector) -> Vector:
+    return Vector(*(function(a) for a in vector))

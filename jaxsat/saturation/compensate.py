@@ -1,30 +1,36 @@
 """All segments of a recording, in parallel or one after the other (paper A, Section 5)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.smoother import Rows, closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.saturation.layout import Layout, Trial, bucket, gather, pad
-from jaxsat.saturation.methods import Compensation, SegmentFill, solve_segment
-from jaxsat.saturation.segment import Segment, arrivals
+from jaxsat.saturation.arrival import arrivals
+from jaxsat.saturation.layout import (
+    Arrays,
+    Sizes,
+    Trial,
+    Values,
+    bucket,
+    count_values,
+    gather,
+    pad,
+    padded_sizes,
+)
+from jaxsat.saturation.methods import Options, SegmentFill, solve_segment
 from jaxsat.saturation.solvers import Status
+from jaxsat.signals.rests import Segments
 
 Progress = Callable[[int, int], None]
 """Called with (segments done, segments in all)."""
 
-
-class Options(eqx.Module):
-    """How the search runs; see `jaxsat.config.Saturation`."""
-
-    method: Compensation = eqx.field(static=True)
-    free_peak_time: bool = eqx.field(static=True)
-    max_iterations: int = eqx.field(static=True)
-    tolerance: Float[Array, ""]
+# So many segments are solved at once; more would gain nothing on a CPU and wait for the slowest.
+LANES = 64
 
 
 class Fills(eqx.Module):
@@ -44,7 +50,7 @@ class Fills(eqx.Module):
     def nothing(trial: Trial, count: int) -> "Fills":
         zeros = np.zeros(count)
         return Fills(
-            signal=trial.signal.copy(),
+            signal=np.array(trial.signal),
             at_bound=np.zeros(trial.signal.shape, bool),
             status=np.full(count, int(Status.NOTHING_TO_DO)),
             cost_before=zeros,
@@ -53,10 +59,63 @@ class Fills(eqx.Module):
             iterations=np.zeros(count, int),
         )
 
+    def record(
+        self, trial: Trial, segments: Int[np.ndarray, "L"], found: SegmentFill, values: Values
+    ) -> None:
+        """Write what was found for some segments into the arrays of the whole recording."""
+        found, values = jax.tree.map(lambda x: np.asarray(x)[: len(segments)], (found, values))
+        real = values.sample < len(trial.signal)
+        sample, channel = values.sample[real], values.channel[real]
+        self.signal[sample, channel] = (
+            trial.signal[sample, channel] + trial.sign[sample, channel] * found.delta[real]
+        )
+        self.at_bound[sample, channel] = found.at_bound[real]
+        self.status[segments] = found.solution.status
+        self.cost_before[segments], self.cost_after[segments] = found.cost_before, found.solution.value
+        self.residual[segments], self.iterations[segments] = (
+            found.solution.residual,
+            found.solution.iterations,
+        )
 
-@eqx.filter_jit
-def _filter(signal, period, variance, rows: Rows, prior: NavState, covariance, gravity):
-    return closed_loop(Samples(signal, period, variance), rows, prior, covariance, gravity)
+
+def filter_trial(
+    trial: Trial, signal: Float[Arrays, "N 6"], share: Float[Arrays, ""]
+) -> tuple[NavState, Float[Array, "N1 9 9"]]:
+    """The departures of all segments: one filter pass over the recording with a filled signal.
+
+    Methods 1 and 2 do not say how sure they are of a filled value, so each enters with `share` times the variance
+    that its bounds leave: departures know how uncertain their tilt is, and one bad fill does not bend what follows.
+    """
+    samples = Samples(signal, trial.period, trial.variance + share * trial.fill_variance)
+    return closed_loop(samples, trial.rows, trial.prior, trial.prior_covariance, trial.gravity)
+
+
+# A filled value lies anywhere within its bounds; where none is filled yet, δ is 0 and its variance the second
+# moment about that end, four times as much.
+UNFILLED, FILLED = 4.0, 1.0
+
+
+def solve_segments(
+    trial: Trial,
+    states: NavState,
+    covariances: Float[Arrays, "L 9 9"],
+    table: Float[Arrays, "L 10 10"],
+    departure: Int[Arrays, "L"],
+    arrival: Int[Arrays, "L"],
+    sizes: Sizes,
+    options: Options,
+) -> tuple[SegmentFill, Values]:
+    """Some segments of a recording side by side, from the filtered states at their departures."""
+
+    def solve(state, covariance, table, departure, arrival):
+        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes)
+        return solve_segment(segment, jnp.asarray(trial.gravity), options), values
+
+    return jax.vmap(solve)(states, covariances, table, departure, arrival)
+
+
+_filter = eqx.filter_jit(filter_trial)
+_solve = eqx.filter_jit(solve_segments)
 
 
 @eqx.filter_jit
@@ -64,107 +123,84 @@ def _arrivals(signal, period, variance, rows: Rows, segment_at, starts, count: i
     return arrivals(Samples(signal, period, variance), rows, segment_at, starts, count)
 
 
-@eqx.filter_jit
-def _solve(segment: Segment, gravity, options: Options) -> SegmentFill:
-    return solve_segment(
-        segment,
-        gravity,
-        options.tolerance,
-        options.method,
-        options.free_peak_time,
-        options.max_iterations,
-    )
-
-
-def arrival_table(trial: Trial, layout: Layout) -> Float[np.ndarray, "S 10 10"]:
-    """Λ of every segment's arrival; zeros where no rest follows. Independent of δ: rests do not saturate."""
-    n, segments = len(trial.signal), layout.segments
-    segment_at, starts = np.full(n, -1), np.zeros(n, bool)
+def arrival_marks(count: int, segments: Segments) -> tuple[Int[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
+    """The segment that each rest sample is the arrival of (-1 for none), and the first samples of arrivals."""
+    segment_at, starts = np.full(count, -1), np.zeros(count, bool)
     for index, (start, end) in enumerate(zip(segments.arrival, segments.rest_end, strict=True)):
-        segment_at[start:end] = index
-        starts[start : start + 1] = True
-    table = _arrivals(
-        trial.signal,
-        trial.period,
-        trial.variance,
-        trial.rows,
-        segment_at,
-        starts,
-        bucket(len(segments), 16),
-    )
-    table = np.asarray(table)[: len(segments)].copy()
-    table[segments.departure < 0] = 0.0
-    return table
+        # A segment without a departure has no known start, so its arrival tells nothing about it.
+        if segments.departure[index] >= 0:
+            segment_at[start:end] = index
+            starts[start : start + 1] = True
+    return segment_at, starts
 
 
-def _record(fills: Fills, trial: Trial, layout: Layout, index: int, found: SegmentFill) -> None:
-    """Write what was found for one segment into the arrays of the whole recording."""
-    found = jax.tree.map(np.asarray, found)
-    mine = layout.values_of(index)
-    sample, channel = layout.sample[mine], layout.channel[mine]
-    count = len(sample)
-    fills.signal[sample, channel] = (
-        trial.signal[sample, channel] + trial.sign[sample, channel] * found.delta[:count]
-    )
-    fills.at_bound[sample, channel] = found.at_bound[:count]
-    fills.status[index] = found.solution.status
-    fills.cost_before[index], fills.cost_after[index] = found.cost_before, found.solution.value
-    fills.residual[index], fills.iterations[index] = found.solution.residual, found.solution.iterations
+def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 10"]:
+    """Λ of every segment's arrival; zeros where no rest follows. Independent of δ: rests do not saturate."""
+    marks = arrival_marks(len(trial.signal), segments)
+    count = bucket(len(segments), 16)
+    table = _arrivals(trial.signal, trial.period, trial.variance, trial.rows, *marks, count)
+    return np.asarray(table)[: len(segments)]
+
+
+def _solve_some(
+    trial, departures, table, segments: Segments, mine, sizes: Sizes, options, fills: Fills
+) -> None:
+    """Solve the segments `mine`, padded to a bucket of lanes, and record them."""
+    lanes = bucket(len(mine), 1)
+    given = (*departures, table[mine], segments.departure[mine], segments.arrival[mine])
+    found, values = _solve(trial, *jax.tree.map(lambda x: pad(x, lanes), given), sizes, options)
+    fills.record(trial, mine, found, values)
 
 
 def compensate_parallel(
-    trial: Trial, layout: Layout, options: Options, sweeps: int = 2, progress: Progress | None = None
+    trial: Trial, segments: Segments, options: Options, sweeps: int = 2, progress: Progress | None = None
 ) -> Fills:
-    """Solve each segment on its own from one filter pass over the recording; then again with the filled signal.
-
-    Methods 1 and 2 do not say how sure they are of a filled value, so each enters the filter with the variance
-    that its bounds leave: departures know how uncertain their tilt is, and one bad fill does not bend what
-    follows. In the first pass δ is 0 and the variance is the second moment about it.
-    """
-    busy = np.unique(layout.gap_segment).tolist()
-    fills = Fills.nothing(trial, len(layout.segments))
-    table = arrival_table(trial, layout)
-    count = 0
-
+    """Solve each segment on its own from one filter pass over the recording; then again with the filled signal."""
+    fills = Fills.nothing(trial, len(segments))
+    table = arrival_table(trial, segments)
+    chunks = list(_chunks(*count_values(trial.sign, segments)))
+    total, done = sum(len(mine) for mine, _ in chunks), 0
     for sweep in range(sweeps):
-        # The second moment of a uniform distribution about its end is four times that about its middle.
-        variance = trial.variance + (4.0 if sweep == 0 else 1.0) * trial.fill_variance
-        states, covariances = _filter(
-            fills.signal,
-            trial.period,
-            variance,
-            trial.rows,
-            trial.prior,
-            trial.prior_covariance,
-            trial.gravity,
-        )
-        states, covariances = jax.tree.map(np.asarray, (states, covariances))
-        for i in busy:
-            at = max(0, int(layout.segments.departure[i]))
-            state = jax.tree.map(lambda x, at=at: x[at], states)
-            segment = gather(trial, layout, i, state, covariances[at], table[i])
-            _record(fills, trial, layout, i, _solve(segment, trial.gravity, options))
-            count += 1
+        filtered = _filter(trial, fills.signal, np.asarray(UNFILLED if sweep == 0 else FILLED))
+        filtered = jax.tree.map(np.asarray, filtered)
+        for mine, sizes in chunks:
+            at = np.maximum(segments.departure[mine], 0)
+            departures = jax.tree.map(lambda x, at=at: x[at], filtered)
+            _solve_some(trial, departures, table, segments, mine, sizes, options, fills)
+            done += len(mine)
             if progress:
-                progress(count, sweeps * len(busy))
+                progress(done, sweeps * total)
     return fills
 
 
+def _chunks(
+    samples: Int[np.ndarray, "S"], values: Int[np.ndarray, "S"]
+) -> Iterator[tuple[Int[np.ndarray, "L"], Sizes]]:
+    """Segments that saturate, those of like size together; a short recording is one chunk, so one program."""
+    busy = np.flatnonzero(values)
+    busy = busy[np.lexsort((samples[busy], values[busy]))]
+    for first in range(0, len(busy), LANES):
+        mine = busy[first : first + LANES]
+        yield mine, padded_sizes(int(samples[mine].max()), int(values[mine].max()))
+
+
 def compensate_sequential(
-    trial: Trial, layout: Layout, options: Options, progress: Progress | None = None
+    trial: Trial, segments: Segments, options: Options, progress: Progress | None = None
 ) -> Fills:
     """The paper's order: each segment departs from the filtered end of the one before, filled already."""
-    segments = layout.segments
     fills = Fills.nothing(trial, len(segments))
-    table = arrival_table(trial, layout)
-    busy = np.unique(layout.gap_segment).tolist()
+    table = arrival_table(trial, segments)
+    samples, values = count_values(trial.sign, segments)
+    busy = np.flatnonzero(values)
+    # One program for all of them.
+    sizes = padded_sizes(int(samples[busy].max(initial=1)), int(values[busy].max(initial=1)))
     state, covariance, at = trial.prior, trial.prior_covariance, 0
-    for count, index in enumerate(busy):
+    for count, index in enumerate(busy.tolist()):
         departure = max(0, int(segments.departure[index]))
         state, covariance = _filter_to(trial, fills.signal, state, covariance, at, departure)
         at = departure
-        segment = gather(trial, layout, index, state, covariance, table[index])
-        _record(fills, trial, layout, index, _solve(segment, trial.gravity, options))
+        here = jax.tree.map(lambda x: np.asarray(x)[None], (state, covariance))
+        _solve_some(trial, here, table, segments, np.array([index]), sizes, options, fills)
         if progress:
             progress(count + 1, len(busy))
     return fills
@@ -184,13 +220,18 @@ def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, st
         trial.rows,
         (span(trial.rows.rest) & fresh, span(trial.rows.height) & fresh),
     )
-    states, covariances = _filter(
-        span(signal),
-        span(trial.period),
-        span(trial.variance + trial.fill_variance),
-        rows,
-        state,
-        covariance,
-        trial.gravity,
+    part = Trial(
+        signal=span(trial.signal),
+        period=span(trial.period),
+        variance=span(trial.variance),
+        sign=span(trial.sign),
+        clean=span(trial.clean),
+        bound=trial.bound,
+        rows=rows,
+        prior=state,
+        prior_covariance=covariance,
+        gravity=trial.gravity,
+        heights=trial.heights,
     )
+    states, covariances = _filter(part, span(signal), np.asarray(FILLED))
     return jax.tree.map(lambda x: np.asarray(x[count - 1]), states), np.asarray(covariances[count - 1])

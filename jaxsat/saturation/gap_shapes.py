@@ -10,7 +10,6 @@ from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Shape = Literal["triangle", "quadratic"]
@@ -41,8 +40,8 @@ class Peak(eqx.Module):
 
 
 def edge_slope(
-    near: Float[np.ndarray, "*gaps"], next_: Float[np.ndarray, "*gaps"], far: Float[np.ndarray, "*gaps"]
-) -> Float[np.ndarray, "*gaps"]:
+    near: Float[Array, "*gaps"], next_: Float[Array, "*gaps"], far: Float[Array, "*gaps"]
+) -> Float[Array, "*gaps"]:
     """Slope away from the gap, at its edge, of the parabola through three samples (per sample)."""
     return (-3.0 * near + 4.0 * next_ - far) / 2.0
 

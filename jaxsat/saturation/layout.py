@@ -1,117 +1,84 @@
 """From a recording to its segments: which saturated values and gaps belong where, gathered and padded."""
 
+from typing import NamedTuple
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState
 from jaxsat.saturation.gap_shapes import Edges, edge_slope
 from jaxsat.saturation.segment import Segment
-from jaxsat.signals.rails import Gaps
 from jaxsat.signals.rests import Segments
+
+Arrays = Array | np.ndarray
 
 
 class Trial(eqx.Module):
     """Everything that the smoother and the segments of one recording need, in numbers."""
 
-    signal: Float[np.ndarray, "N 6"]
-    period: Float[np.ndarray, "N"]
-    variance: Float[np.ndarray, "N 6"]
-    sign: Int[np.ndarray, "N 6"]
+    signal: Float[Arrays, "N 6"]
+    period: Float[Arrays, "N"]
+    variance: Float[Arrays, "N 6"]
+    sign: Int[Arrays, "N 6"]
     """Direction of saturation, 0 where there is none."""
-    clean: Bool[np.ndarray, "N 6"]
+    clean: Bool[Arrays, "N 6"]
     """Measured and not saturated."""
-    bound: Float[np.ndarray, "6"]
+    bound: Float[Arrays, "6"]
     """δ_b of each channel."""
     rows: Rows
     prior: NavState
-    prior_covariance: Float[np.ndarray, "9 9"]
-    gravity: Float[np.ndarray, ""]
+    prior_covariance: Float[Arrays, "9 9"]
+    gravity: Float[Arrays, ""]
+    heights: bool = eqx.field(static=True)
+    """Whether f(δ) takes height rows into account."""
 
     @property
-    def fill_variance(self) -> Float[np.ndarray, "N 6"]:
+    def fill_variance(self) -> Float[Arrays, "N 6"]:
         """Variance of a filled value of which only the bounds are known: uniform in 0 ≤ δ ≤ δ_b."""
-        return np.where(self.sign != 0, self.bound**2 / 12.0, 0.0)
+        return jnp.where(jnp.asarray(self.sign) != 0, jnp.asarray(self.bound**2 / 12.0)[None], 0.0)
+
+    def padded(self) -> "Trial":
+        """With blank samples behind the end, to a length that recordings of about the same length share."""
+        count = len(self.signal)
+        size = 256
+        while size < count:
+            # 256, 384, 512, 768, …: a third is wasted at most.
+            size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+        extra = {name: pad(np.asarray(getattr(self, name)), size) for name in _SAMPLED}
+        rows = eqx.tree_at(
+            lambda r: (r.rest, r.height),
+            self.rows,
+            (pad(np.asarray(self.rows.rest), size), pad(np.asarray(self.rows.height), size)),
+        )
+        return eqx.tree_at(
+            lambda t: (*(getattr(t, name) for name in _SAMPLED), t.rows), self, (*extra.values(), rows)
+        )
 
 
-class Layout(eqx.Module):
-    """Segments, gaps and saturated values of a recording in the order of time, so each segment is a slice."""
-
-    segments: Segments
-    edges: Float[np.ndarray, "G 8"]
-    """Of each gap the fields of `Edges`, time in samples of the recording."""
-    gap_segment: Int[np.ndarray, "G"]
-    """The segment of each gap; does not decrease."""
-    sample: Int[np.ndarray, "K"]
-    """Of each saturated value; so are the next two."""
-    channel: Int[np.ndarray, "K"]
-    gap: Int[np.ndarray, "K"]
-
-    def gaps_of(self, segment: int) -> slice:
-        """The gaps of a segment."""
-        return slice(*np.searchsorted(self.gap_segment, (segment, segment + 1)).tolist())
-
-    def values_of(self, segment: int) -> slice:
-        """The saturated values of a segment."""
-        gaps = self.gaps_of(segment)
-        return slice(*np.searchsorted(self.gap, (gaps.start, gaps.stop)).tolist())
-
-    @staticmethod
-    def of(trial: Trial, segments: Segments, gaps: Gaps) -> "Layout":
-        order = np.lexsort((gaps.channel, gaps.start))
-        gaps = jax.tree.map(lambda x: x[order], gaps)
-        size = gaps.end - gaps.start
-        first = np.cumsum(size) - size
-        gap = np.repeat(np.arange(len(size)), size)
-        sample = np.arange(size.sum()) - (first - gaps.start)[gap]
-        channel = gaps.channel[gap]
-        value = gaps.sign[gap] * trial.signal[sample, channel]
-        rail = np.maximum.reduceat(value, first) if len(size) else np.zeros(0)
-        gap_segment = np.searchsorted(segments.arrival, gaps.start, side="right")
-        return Layout(segments, gap_edges(trial, gaps, rail), gap_segment, sample, channel, gap)
+_SAMPLED = ("signal", "period", "variance", "sign", "clean")
 
 
-def gap_edges(trial: Trial, gaps: Gaps, rail: Float[np.ndarray, "G"]) -> Float[np.ndarray, "G 8"]:
-    """The fields of `Edges` of all gaps, in the direction of their rail, time in samples of the recording.
+class Sizes(NamedTuple):
+    """Padded lengths of a segment; equal ones share a compiled program."""
 
-    Slopes come from the three samples beside a gap (Section 4.2); they are sound only where all three were
-    measured, lie inside the recording and do not saturate themselves, and where the gap has two samples.
-    """
-    n = len(trial.signal)
-    offsets = np.arange(1, 4)
-    before = gaps.start[:, None] - offsets
-    after = gaps.end[:, None] + offsets - 1
-    inside = (before >= 0).all(1) & (after < n).all(1)
-    before, after = np.clip(before, 0, n - 1), np.clip(after, 0, n - 1)
-    channel, sign = gaps.channel[:, None], gaps.sign[:, None]
-    left, right = sign * trial.signal[before, channel], sign * trial.signal[after, channel]
-    clean = trial.clean[before, channel].all(1) & trial.clean[after, channel].all(1)
-    fields = (
-        gaps.start - 1,
-        gaps.end,
-        np.minimum(left[:, 0], rail),
-        np.minimum(right[:, 0], rail),
-        -edge_slope(*left.T),
-        edge_slope(*right.T),
-        rail,
-        inside & clean & (gaps.end - gaps.start > 1),
-    )
-    return np.stack([np.asarray(field, float) for field in fields], axis=1)
+    samples: int
+    values: int
 
 
-# A padded gap is a flat one without samples.
-_NO_GAP = np.array([[0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
-
-
-def bucket(count: int, smallest: int) -> int:
-    """`smallest` times a power of four: coarse steps, so shapes are shared and few programs are compiled."""
+def bucket(count: int, smallest: int, factor: int = 4) -> int:
+    """`smallest` times a power of `factor`: coarse steps, so shapes are shared and few programs are compiled."""
     size = smallest
     while size < count:
-        size *= 4
+        size *= factor
     return size
+
+
+def padded_sizes(samples: int, values: int, factor: int = 4) -> Sizes:
+    """For segments of at most so many samples and saturated values; a smaller factor wastes and shares less."""
+    return Sizes(bucket(samples, 256, factor), bucket(values, 16, factor))
 
 
 def pad(x: np.ndarray, size: int) -> np.ndarray:
@@ -119,45 +86,119 @@ def pad(x: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([x, np.zeros((size - len(x), *x.shape[1:]), x.dtype)])
 
 
+def count_values(
+    sign: Int[np.ndarray, "N 6"], segments: Segments
+) -> tuple[Int[np.ndarray, "S"], Int[np.ndarray, "S"]]:
+    """Samples and saturated values of each segment."""
+    total = np.concatenate([[0], np.cumsum((sign != 0).sum(axis=1))])
+    start = np.maximum(segments.departure, 0)
+    return segments.arrival - start, total[segments.arrival] - total[start]
+
+
+class Values(eqx.Module):
+    """Where the saturated values of a segment lie in the recording; a padded one lies behind its end."""
+
+    sample: Int[Array, "m"]
+    channel: Int[Array, "m"]
+
+
 def gather(
     trial: Trial,
-    layout: Layout,
-    index: int,
-    departure: NavState,
-    departure_covariance: Float[np.ndarray, "9 9"],
-    arrival: Float[np.ndarray, "10 10"],
-) -> Segment:
-    """One segment as a padded `Segment`; departure and arrival come from the whole recording."""
-    start = max(0, int(layout.segments.departure[index]))
-    stop = int(layout.segments.arrival[index])
-    n = bucket(stop - start, 256)
-    gaps, values = layout.gaps_of(index), layout.values_of(index)
-    channel, sample = layout.channel[values], layout.sample[values]
-    count = gaps.stop - gaps.start
-    cut, element = np.unique(sample - start, return_inverse=True)
-    m = g = bucket(len(sample), 16)
-    edges = np.concatenate([layout.edges[gaps], np.repeat(_NO_GAP, g - count, axis=0)])
-    edges[:count, :2] -= start
-    fields = jnp.asarray(edges.T)
-    at_arrival = stop < len(trial.signal)
-    arrays = {
-        "signal": pad(trial.signal[start:stop], n),
-        "period": pad(trial.period[start:stop], n),
+    departure: Int[Array, ""],
+    arrival: Int[Array, ""],
+    state: NavState,
+    covariance: Float[Array, "9 9"],
+    table: Float[Array, "10 10"],
+    sizes: Sizes,
+) -> tuple[Segment, Values]:
+    """One segment, padded; [departure, arrival) are its samples.
+
+    state, covariance: of the filter at departure; table: Λ of the arrival.
+    """
+    n, m = sizes
+    count = len(trial.signal)
+    start = jnp.maximum(departure, 0)
+    at = start + jnp.arange(n)
+    inside = at < arrival
+    safe = jnp.minimum(at, count - 1)
+
+    def window(x):
+        x = jnp.asarray(x)[safe]
+        return jnp.where(inside.reshape(-1, *[1] * (x.ndim - 1)), x, 0)
+
+    signal, sign, variance = window(trial.signal), window(trial.sign), window(trial.variance)
+    saturated = sign != 0
+    (cut,) = jnp.nonzero(jnp.any(saturated, axis=1), size=m, fill_value=n)
+    (place,) = jnp.nonzero(saturated.reshape(-1), size=m, fill_value=6 * n)
+    valid = place < 6 * n
+    sample, channel = jnp.where(valid, place // 6, 0), jnp.where(valid, place % 6, 0)
+    gap, edges = _gaps(trial, signal, sign, start, sample, channel, valid, m)
+    height = None
+    if trial.heights:
+        height = (arrival < count) & jnp.asarray(trial.rows.height)[jnp.minimum(arrival, count - 1)]
+    segment = Segment(
+        signal=signal,
+        period=window(trial.period),
         # One variance for the three axes of a sensor, on the safe side where they differ.
-        "variance": pad(trial.variance[start:stop].reshape(-1, 2, 3).max(axis=2), n),
-        "cut": np.concatenate([cut, np.full(m - len(cut), n)]),
-        "element": pad(element, m),
-        "channel": pad(channel, m),
-        "sign": pad(trial.sign[sample, channel].astype(float), m),
-        "bound": pad(trial.bound[channel], m),
-        "gap": pad(layout.gap[values] - gaps.start, m),
-        "departure_covariance": departure_covariance,
-        "arrival": arrival,
-        "height": at_arrival and np.asarray(trial.rows.height)[stop],
-        "height_variance": trial.rows.height_variance,
-    }
-    return Segment(
-        departure=departure,
-        edges=Edges(*fields[:7], sound=fields[7] > 0),
-        **{name: jnp.asarray(value) for name, value in arrays.items()},
+        variance=variance.reshape(n, 2, 3).max(axis=2),
+        cut=cut,
+        element=jnp.where(valid, jnp.searchsorted(cut, sample), 0),
+        channel=channel,
+        sign=jnp.where(valid, sign[sample, channel], 0).astype(signal.dtype),
+        bound=jnp.where(valid, jnp.asarray(trial.bound)[channel], 0.0),
+        gap=gap,
+        edges=edges,
+        departure=state,
+        departure_covariance=covariance,
+        arrival=table,
+        height=height,
+        height_variance=jnp.asarray(trial.rows.height_variance),
     )
+    return segment, Values(jnp.where(valid, start + sample, count), channel)
+
+
+def _gaps(trial: Trial, signal, sign, start, sample, channel, valid, size: int):
+    """The gap of each saturated value, and the edges of each gap in the direction of its rail.
+
+    Slopes come from the three samples beside a gap (Section 4.2); they are sound only where all three were
+    measured, lie inside the recording and do not saturate themselves, and where the gap has two samples.
+    """
+    n, count = len(signal), len(trial.signal)
+    still = jnp.zeros_like(sign[:1])
+    begins = (sign != 0) & (sign != jnp.concatenate([still, sign[:-1]]))
+    ends = (sign != 0) & (sign != jnp.concatenate([sign[1:], still]))
+    # Channel after channel, so that the i-th beginning and the i-th end are those of the same gap.
+    number = jnp.cumsum(begins.T.reshape(-1)).reshape(6, n) - 1
+    (first,) = jnp.nonzero(begins.T.reshape(-1), size=size, fill_value=6 * n)
+    (last,) = jnp.nonzero(ends.T.reshape(-1), size=size, fill_value=6 * n)
+    real = first < 6 * n
+    axis, first, last = jnp.where(real, first // n, 0), first % n, last % n
+    way = sign[first, axis].astype(signal.dtype)
+    gap = jnp.where(valid, number[channel, sample], size - 1)
+    value = jnp.where(valid, signal[sample, channel] * sign[sample, channel].astype(signal.dtype), -jnp.inf)
+    rail = jnp.full(size, -jnp.inf, signal.dtype).at[gap].max(value)
+    offsets = jnp.arange(1, 4)
+    before = start + first[:, None] - offsets[None]
+    after = start + last[:, None] + offsets[None]
+    whole = (before >= 0).all(1) & (after < count).all(1)
+    before, after = jnp.maximum(before, 0), jnp.minimum(after, count - 1)
+    original, clean = jnp.asarray(trial.signal), jnp.asarray(trial.clean)
+    left = way[:, None] * original[before, axis[:, None]]
+    right = way[:, None] * original[after, axis[:, None]]
+    sound = clean[before, axis[:, None]].all(1) & clean[after, axis[:, None]].all(1)
+    fields = (
+        (first - 1).astype(signal.dtype),
+        (last + 1).astype(signal.dtype),
+        jnp.minimum(left[:, 0], rail),
+        jnp.minimum(right[:, 0], rail),
+        -edge_slope(*left.T),
+        edge_slope(*right.T),
+        rail,
+    )
+    # A padded gap is a flat one without samples.
+    blank = (0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    edges = Edges(
+        *(jnp.where(real, field, empty) for field, empty in zip(fields, blank, strict=True)),
+        sound=real & whole & sound & (last > first),
+    )
+    return gap, edges

@@ -6,13 +6,15 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.saturation.gap_shapes import peak, shape_value
-from jaxsat.saturation.segment import Segment, arrival_sensitivity, condense, objective
-from jaxsat.saturation.solvers import Solution, Status, projected_gradient
+from jaxsat.saturation.segment import Segment, condense, value_and_root, value_gradient_root
+from jaxsat.saturation.solvers import Solution, Status, projected_gauss_newton, projected_gradient
 
 Compensation = Literal["direct", "triangle", "quadratic"]
+Solver = Literal["gauss_newton", "projected_gradient"]
+_SOLVERS = {"gauss_newton": projected_gauss_newton, "projected_gradient": projected_gradient}
 
 
 class Search(eqx.Module):
@@ -69,40 +71,50 @@ class SegmentFill(eqx.Module):
     """δ ends at its bound: the bound decided, not the data."""
 
 
-def solve_segment(
-    segment: Segment,
-    gravity: Float[Array, ""],
-    tolerance: Float[Array, ""],
-    method: Compensation,
-    free_peak_time: bool,
-    max_iterations: int,
-) -> SegmentFill:
-    """min over δ of f(δ), bounded one-sided (Eq. 18-20), by projected gradient through the inner minimum.
+class Options(eqx.Module):
+    """How the search runs; see `jaxsat.config.Saturation`."""
+
+    method: Compensation = eqx.field(static=True)
+    solver: Solver = eqx.field(static=True)
+    free_peak_time: bool = eqx.field(static=True)
+    max_iterations: Int[Array, ""]
+    tolerance: Float[Array, ""]
+
+
+def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options) -> SegmentFill:
+    """min over δ of f(δ), bounded one-sided (Eq. 18-20), through the inner minimum.
 
     A segment that no rest follows (its arrival is zero) keeps δ = 0 and says so; a search that ends above
     f(0) keeps δ = 0 too.
     """
-    search = search_space(method, segment, free_peak_time)
+    search = search_space(options.method, segment, options.free_peak_time)
     condensed = condense(segment)
-    zero = jnp.zeros_like(segment.bound)
-    before = objective(zero, condensed, gravity)
-    rows, weight = arrival_sensitivity(zero, condensed, gravity)
-    columns = jax.jacfwd(search.delta)(search.start).T @ rows
-    curvature = jnp.einsum("pi,ij,pj->p", columns, weight, columns)
-    # A variable that the data do not see is scaled by its range; one without range does not move.
-    scale = jnp.where(
-        search.upper > 0.0,
-        1.0 / jnp.sqrt(curvature + 1.0 / jnp.where(search.upper > 0.0, search.upper, 1.0) ** 2),
-        1.0,
+
+    def linearise(p):
+        delta, back = jax.vjp(search.delta, p)
+        value, gradient, columns = value_gradient_root(delta, condensed, gravity)
+        return value, *jax.tree.map(lambda x: back(x)[0], (gradient, columns))
+
+    # f(0), and the curvature at the start; both from one compiled evaluation.
+    first, back = jax.vjp(search.delta, search.start)
+    values, columns = jax.lax.map(
+        lambda delta: value_and_root(delta, condensed, gravity), jnp.stack([jnp.zeros_like(first), first])
     )
-    solution = projected_gradient(
-        lambda p: objective(search.delta(p), condensed, gravity),
+    before = values[0]
+    curvature = sum(back(column[1])[0] ** 2 for column in columns)
+    # A variable that the data do not see is scaled by its range; one without range does not move.
+    has_range = search.upper > 0.0
+    scale = jnp.where(
+        has_range, 1.0 / jnp.sqrt(curvature + 1.0 / jnp.where(has_range, search.upper, 1.0) ** 2), 1.0
+    )
+    solution = _SOLVERS[options.solver](
+        linearise,
         search.start,
         jnp.zeros_like(search.upper),
         search.upper,
         scale,
-        tolerance,
-        max_iterations,
+        options.tolerance,
+        options.max_iterations,
     )
     blind = ~jnp.any(segment.arrival != 0.0)
     keep = blind | (solution.value > before)

@@ -3,14 +3,18 @@
 A segment is departure (a known state) → moving samples, no row → arrival (rest samples). Two closed forms make
 f(δ) cheap and exact; the sample-by-sample filter is their oracle in the tests:
 
-1. The moving samples collapse into one interval, and what lies between saturated samples does so once for all δ.
+1. The moving samples collapse into one transition, and what lies between saturated samples does so once for all δ.
 2. The arrival is a fixed quadratic. In the body frame at arrival the rest samples are the same whatever δ is;
    only the velocity and the direction of gravity on arrival depend on it. With m = [θ, v̂ + v_e] and γ = [g; 1]
    in that frame, the rows of the rest cost ½ [m; γ]ᵀ Λ [m; γ], and Λ is built once per recording.
 
-The minimum over m with the arriving covariance P needs no inverse of P, so singular priors are fine:
-f = ½ mᵀΛ_mm m + mᵀh + ½ γᵀΛ_γγ γ − ½ uᵀ(I + P Λ_mm)⁻¹P u, with h = Λ_mγ γ and u = Λ_mm m + h at the mean.
+The minimum over m with the arriving covariance P needs no inverse of P, so singular priors are fine. With
+Λ_mm = G Gᵀ, h = Λ_mγ γ, u = Λ_mm m + h at the mean and λ = (I + Λ_mm P)⁻¹ u, which is u − G(I + GᵀPG)⁻¹GᵀPu,
+f = ½ xᵀΛ_mm x + hᵀx + ½ γᵀΛ_γγ γ + ½ λᵀPλ at x = m − Pλ.
+λ is also the slope of f in m, and −½λλᵀ that in P: at the inner minimum only the direct dependence counts.
 """
+
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -18,26 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsat.inertial import kalman
-from jaxsat.inertial.preintegration import alternate, input_effects, remainders, stretches
-from jaxsat.inertial.rotations import quat_conjugate, quat_multiply, quat_rotate, quat_to_matrix, skew
-from jaxsat.inertial.smoother import HEIGHT, Rows
-from jaxsat.inertial.strapdown import (
-    Interval,
-    Moments,
-    NavState,
-    Samples,
-    advance,
-    error_transition,
-    noise_covariance,
-    rotate_noise,
-    sample_intervals,
-    sample_noise,
-)
+from jaxsat.inertial.components import Cholesky, Matrix, Quaternion, Scalar, Vector
+from jaxsat.inertial.preintegration import Passage, Stretch, passage, stretches
+from jaxsat.inertial.strapdown import NavState
 from jaxsat.saturation.gap_shapes import Edges
 
-# Position is not seen by a velocity row, so the arrival speaks of [θ, v] only.
-_SEEN = np.array([0, 1, 2, 6, 7, 8])
+# The smoother's order is [θ, r, v]; here position comes last, so that it can be left out.
+_POSITION_LAST = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])
 
 
 class Segment(eqx.Module):
@@ -68,166 +59,301 @@ class Segment(eqx.Module):
     departure_covariance: Float[Array, "9 9"]
     arrival: Float[Array, "10 10"]
     """Λ over [m (6), γ (4)]; zeros where no rest follows."""
-    height: Bool[Array, ""]
-    """Whether the arrival is at height zero."""
+    height: Bool[Array, ""] | None
+    """Whether the arrival is at height zero; None where heights are not used at all."""
     height_variance: Float[Array, ""]
 
 
 class Condensed(eqx.Module):
-    """A segment as f(δ) sees it: saturated samples, and between them stretches that do not depend on δ.
+    """A segment as f(δ) sees it: saturated samples, and before each a stretch that does not depend on δ.
 
-    Element j is stretch j followed by saturated sample j; the last sample is a blank one.
+    One blank sample ends the last stretch. Vectors are in the body frame at departure.
     """
 
-    stretches: Interval
+    stretches: Stretch
     """M+1 of them."""
-    noise: Moments
-    """Of the stretches."""
-    signal: Float[Array, "M1 6"]
+    signal: Float[Array, "6 M1"]
     period: Float[Array, "M1"]
-    variance: Float[Array, "M1 2"]
-    segment: Segment
+    variance: tuple[Float[Array, "M1"], Float[Array, "M1"]]
+    element: Int[Array, "m"]
+    channel: Int[Array, "m"]
+    sign: Float[Array, "m"]
+    velocity: Vector
+    """At departure."""
+    height: Float[Array, ""]
+    """At departure."""
+    up: Vector
+    """Unit."""
+    covariance: Matrix
+    """At departure, of [θ, v], with position [θ, v, r]."""
+    arrival: Matrix
+    """Λ."""
+    root: Matrix
+    """G of Λ_mm = G Gᵀ."""
+    height_row: tuple[Bool[Array, ""], Float[Array, ""]] | None
+    """Whether there is one, and its variance."""
 
 
 def condense(segment: Segment) -> Condensed:
-    """Collapse what lies between the saturated samples; done once per segment."""
+    """All that f(δ) needs and δ does not change; done once per segment."""
+    n = len(segment.period)
+    position = segment.height is not None
+    is_cut = jnp.zeros(n, bool).at[segment.cut].set(True, mode="drop")
+    before, last = stretches(segment.signal, segment.period, segment.variance, is_cut, position)
+    # A blank cut has an empty stretch before it, and the blank end what follows the last cut.
+    blank = Stretch.empty(position, segment.period[0])
+    parts = jax.tree.map(
+        lambda x, end, empty: jnp.append(
+            jnp.where(segment.cut < n, x[jnp.minimum(segment.cut, n - 1)], empty), end
+        ),
+        before,
+        last,
+        blank,
+    )
 
     def pick(x):
         return jnp.concatenate([x.at[segment.cut].get(mode="fill", fill_value=0), jnp.zeros_like(x[:1])])
 
-    between, noise = stretches(segment.signal, segment.period, segment.variance, segment.cut)
+    to_body = Quaternion.of(segment.departure.q_nb).conjugate()
+    R = Matrix.block([[to_body.matrix()]])
+    P = Matrix.of(segment.departure_covariance[_POSITION_LAST][:, _POSITION_LAST])
+    size = 9 if position else 6
+    values, vectors = jnp.linalg.eigh(segment.arrival[:6, :6])
+    one = jnp.ones_like(segment.height_variance)
+    variance = pick(segment.variance)
     return Condensed(
-        stretches=between,
-        noise=noise,
-        signal=pick(segment.signal),
+        stretches=parts,
+        signal=pick(segment.signal).T,
         period=pick(segment.period),
-        variance=pick(segment.variance),
-        segment=segment,
+        variance=(variance[:, 0], variance[:, 1]),
+        element=segment.element,
+        channel=segment.channel,
+        sign=segment.sign,
+        velocity=to_body.rotate(Vector.of(segment.departure.velocity)),
+        height=segment.departure.position[2],
+        up=R(Vector(0.0, 0.0, one)),
+        covariance=_turned(R, _turned(R, P.part(slice(size), slice(size))).T).mirrored(),
+        arrival=Matrix.of(segment.arrival),
+        root=Matrix.of(vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]),
+        height_row=None if segment.height is None else (segment.height, segment.height_variance),
     )
 
 
-def _fill(condensed: Condensed, delta: Float[Array, "m"]) -> tuple[Interval, Moments, Float[Array, "M1 6"]]:
-    """The compensated signal ȳ = y + s·δ (Eq. 17) with the elements' prefixes and the noise of them all."""
-    segment = condensed.segment
-    signal = condensed.signal.at[segment.element, segment.channel].add(segment.sign * delta)
-    upto, noise = alternate(
-        condensed.stretches, condensed.noise, signal, condensed.period, condensed.variance
+def _turned(R: Matrix, columns: Matrix) -> Matrix:
+    """Each vector of some columns turned by R."""
+    return Matrix.block(
+        [[R @ columns.part(slice(i, i + 3), slice(None))] for i in range(0, len(columns.rows), 3)]
     )
-    return upto, noise, signal
 
 
-def _arrive(segment: Segment, upto: Interval, noise: Moments, gravity: Float[Array, ""]):
-    """State, mean error, covariance on arrival and the cost of the height row, if there is one."""
-    start = segment.departure
-    interval = jax.tree.map(lambda x: x[-1], upto)
-    state = advance(start, interval, gravity)
-    zero = jnp.zeros(9, gravity.dtype)
-    mean, covariance = kalman.predict(
-        zero,
-        segment.departure_covariance,
-        error_transition(start.q_nb, interval),
-        zero,
-        rotate_noise(start.q_nb, noise_covariance(noise)),
+def _pass(condensed: Condensed, delta: Float[Array, "m"]) -> Passage:
+    """The motion with the compensated signal ȳ = y + s·δ (Eq. 17)."""
+    signal = condensed.signal.at[condensed.channel, condensed.element].add(condensed.sign * delta)
+    return passage(
+        condensed.stretches,
+        Vector(*signal[:3]),
+        Vector(*signal[3:]),
+        condensed.period,
+        condensed.variance,
     )
-    mean, covariance, cost, _ = kalman.update_row(
-        mean, covariance, HEIGHT, -state.position[2], segment.height_variance, segment.height
+
+
+class _Arrival(eqx.Module):
+    """What a filled signal brings to the rest; vectors in the body frame there."""
+
+    velocity: Vector
+    gravity: Vector
+    """Its reaction: upwards."""
+    height: Array | float
+    turn: Matrix
+    """Takes vectors from the body frame at departure to that at arrival."""
+
+
+def _arrive(condensed: Condensed, motion: Passage, gravity: Float[Array, ""]) -> _Arrival:
+    """The state that the strapdown gives."""
+    tau, fall = motion.duration, condensed.up * gravity
+    turn = motion.rotation.conjugate().matrix()
+    height = 0.0
+    if condensed.height_row is not None:
+        moved = condensed.velocity * tau + motion.levers[1] - fall * (0.5 * tau**2)
+        height = condensed.height + condensed.up.dot(moved)
+    return _Arrival(turn(condensed.velocity + motion.levers[0] - fall * tau), turn(fall), height, turn)
+
+
+def _covariance(condensed: Condensed, motion: Passage) -> Matrix:
+    """Of [θ, v] or [θ, v, r] after the motion, in the body frame at departure."""
+    identity, zero = Matrix.identity(3), Matrix.identity(3, 0.0)
+    rows = [[identity, zero, zero], [-Matrix.skew(motion.levers[0]), identity, zero]]
+    if len(motion.levers) == 2:
+        rows.append([-Matrix.skew(motion.levers[1]), Matrix.identity(3, motion.duration), identity])
+    transition = Matrix.block([row[: len(rows)] for row in rows])
+    return (transition @ condensed.covariance @ transition.T).mirrored() + motion.noise_covariance()
+
+
+class _Inner(eqx.Module):
+    """The inner minimum at one δ."""
+
+    value: Array
+    slope: Matrix
+    """λ, the slope of f in m."""
+    lean: Matrix
+    """The slope of f in γ."""
+    height_slope: Array | float
+    """κ, the slope of f in the height on arrival."""
+    met: Matrix
+    """[x; γ], what the rest sees at the minimum."""
+    root: Matrix
+    """B with B Bᵀ = Λ_mm(I + PΛ_mm)⁻¹, the curvature of f in m."""
+
+
+def _inner(condensed: Condensed, motion: Passage, at: _Arrival) -> _Inner:
+    """Minimise over the error of the state on arrival, in closed form."""
+    P = _covariance(condensed, motion)
+    theta, change, cost = Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0), 0.0
+    gain, weight = Matrix.column((0.0,) * 9), 0.0
+    if condensed.height_row is not None:
+        active, variance = condensed.height_row
+        row = Matrix.column((0.0,) * 6 + tuple(condensed.up))
+        gain = P @ row
+        s = jnp.where(active, (row.T @ gain)[0, 0] + variance, 1.0)
+        weight = jnp.where(active, 1.0 / s, 0.0)
+        pulled = [-g * (weight * at.height) for g in gain.entries()]
+        theta, change = Vector(*pulled[:3]), Vector(*pulled[3:6])
+        P = (P - gain @ gain.T * weight).mirrored()
+        cost = 0.5 * weight * at.height**2
+    mean = Matrix.column((*at.turn(theta), *(at.velocity + at.turn(change))))
+    gamma = Matrix.column((*at.gravity, jnp.ones_like(condensed.height)))
+    P = P.part(slice(6), slice(6))
+    information, cross, constant = _quadratic(condensed.arrival)
+    h = cross @ gamma
+    u = _turned(at.turn.T, information @ mean + h)
+    # Turning G and u to the frame of P is cheaper than turning P to theirs.
+    root = _turned(at.turn.T, condensed.root)
+    seen = P @ root
+    inner = Cholesky((Matrix.identity(6) + root.T @ seen).mirrored())
+    slope = u - root @ inner.solve(seen.T @ u)
+    correction = P @ slope
+    conditioned = mean - _turned(at.turn, correction)
+    # Summed up at the minimiser, so that an error of λ counts in second order only.
+    misfit = conditioned.T @ (information @ conditioned + h * 2.0) + gamma.T @ constant @ gamma
+    value = cost + 0.5 * (misfit + slope.T @ correction)[0, 0]
+    height_slope = 0.0
+    if condensed.height_row is not None:
+        height_slope = weight * (at.height - (gain.part(slice(6), slice(1)).T @ slope)[0, 0])
+    return _Inner(
+        value=cast(Array, value),
+        slope=_turned(at.turn, slope),
+        lean=cross.T @ conditioned + constant @ gamma,
+        height_slope=height_slope,
+        met=Matrix(conditioned.rows + gamma.rows),
+        root=inner.forward(condensed.root.T).T,
     )
-    return state, mean, covariance, cost
+
+
+def _quadratic(arrival: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+    """Λ_mm, Λ_mγ and Λ_γγ."""
+    m, gamma = slice(0, 6), slice(6, 10)
+    return arrival.part(m, m), arrival.part(m, gamma), arrival.part(gamma, gamma)
+
+
+def _pulled(
+    delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""], inner: _Inner
+) -> Scalar:
+    """A function with the slope of f where `inner` was taken, its multipliers held (envelope theorem).
+
+    λ·m + lean·γ + κ·z + ½ [x; γ]ᵀΛ[x; γ] − ½ λᵀPλ − ½ κ²σ² with what multiplies m, γ, z, Λ, P and σ² held: what P
+    says along one direction needs no matrix.
+    """
+    motion = _pass(condensed, delta)
+    at = _arrive(condensed, motion, gravity)
+    slope, lean = inner.slope.entries(), inner.lean.entries()
+    back = at.turn.T
+    turn, push = back(Vector(*slope[:3])), back(Vector(*slope[3:]))
+    pull = (push,)
+    V = motion.levers[0]
+    known = [turn + V.cross(push), push]
+    if condensed.height_row is not None:
+        lift = condensed.up * inner.height_slope
+        pull = (push, lift)
+        known = [known[0] + motion.levers[1].cross(lift), push + lift * motion.duration, lift]
+    start = Matrix.column(sum((tuple(v) for v in known), ()))
+    spread = (start.T @ condensed.covariance @ start)[0, 0] + motion.noise_along(turn, pull)
+    if condensed.height_row is not None:
+        spread = spread + inner.height_slope**2 * condensed.height_row[1]
+    return (
+        at.velocity.dot(Vector(*slope[3:]))
+        + at.gravity.dot(Vector(*lean[:3]))
+        + inner.height_slope * at.height
+        + 0.5 * (inner.met.T @ condensed.arrival @ inner.met)[0, 0]
+        - 0.5 * spread
+    )
+
+
+def value_and_root(
+    delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]
+) -> tuple[Float[Array, ""], tuple[Float[Array, "m"], ...]]:
+    """f(δ) of Eq. 18, and the columns of A with A Aᵀ its Gauss-Newton Hessian."""
+    motion = _pass(condensed, delta)
+    at = _arrive(condensed, motion, gravity)
+    inner = _inner(condensed, motion, at)
+    return inner.value, _root(condensed, motion, at, inner)
+
+
+def value_gradient_root(
+    delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, "m"], tuple[Float[Array, "m"], ...]]:
+    """`value_and_root`, with the gradient of f in between."""
+    inner, columns = _evaluated_once(delta, condensed, gravity)
+    return inner.value, jax.grad(_pulled)(delta, condensed, gravity, inner), columns
+
+
+def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple[Array, ...]]:
+    """The inner minimum and the columns of A, in memory.
+
+    The inner minimum is a thousand operations for a few numbers. XLA would fuse them into the loops over samples
+    that use these numbers, and repeat them for each sample; what a loop returns is stored. That the loop is run
+    once must not be known when it is compiled.
+    """
+
+    def evaluate(carry):
+        motion = _pass(condensed, delta)
+        at = _arrive(condensed, motion, gravity)
+        inner = _inner(condensed, motion, at)
+        return carry[0] + 1, (inner, _root(condensed, motion, at, inner))
+
+    shapes = jax.eval_shape(evaluate, (jnp.asarray(0), None))
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    times = jnp.where(jnp.isnan(delta[0]), 2, 1)
+    return jax.lax.while_loop(lambda carry: carry[0] < times, evaluate, blank)[1]
+
+
+def _root(
+    condensed: Condensed, motion: Passage, at: _Arrival, inner: _Inner
+) -> tuple[Float[Array, "m"], ...]:
+    """Columns of A: the effect of each value on [θ, v] at arrival times `_Inner.root`.
+
+    A unit error of a rate turns θ by T e and pushes v by −[V×]T e, V being what its own sample still adds after
+    its middle and all that follows it; one of a specific force pushes v by T e. The pull of a height row is
+    left out.
+    """
+    # Of each value: the axis that it turns about or pushes along, and the lever, at arrival.
+    attitude = jnp.stack((at.turn @ motion.middle.matrix()).entries())
+    lever = jnp.stack(list(at.turn(motion.after[0] + motion.pushed * 0.5)))
+    rate = condensed.channel < 3
+    axis = jnp.where(rate, condensed.channel, condensed.channel - 3)
+    unit = Vector(*(attitude[3 * i + axis, condensed.element] for i in range(3)))
+    V = Vector(*lever[:, condensed.element])
+    theta = [jnp.where(rate, a, 0.0) for a in unit]
+    speed = [jnp.where(rate, a, b) for a, b in zip(unit.cross(V), unit, strict=True)]
+    effect = Matrix.column((*theta, *speed)) * (condensed.sign * condensed.period[condensed.element])
+    return cast(tuple[Array, ...], (inner.root.T @ effect).entries())
 
 
 def objective(delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]) -> Float[Array, ""]:
-    """f(δ) of Eq. 18: the inner minimum J* over departure, moving samples and the rest that follows."""
-    segment = condensed.segment
-    upto, noise, _ = _fill(condensed, delta)
-    state, mean, covariance, cost = _arrive(segment, upto, noise, gravity)
-    to_body = quat_conjugate(state.q_nb)
-    mean = jnp.concatenate([quat_rotate(to_body, mean[:3]), quat_rotate(to_body, state.velocity + mean[6:])])
-    P = rotate_noise(to_body, covariance)[_SEEN][:, _SEEN]
-    down = jnp.zeros(3, gravity.dtype).at[2].set(gravity)
-    gamma = jnp.concatenate([quat_rotate(to_body, down), jnp.ones(1, gravity.dtype)])
-    information, cross, constant = segment.arrival[:6, :6], segment.arrival[:6, 6:], segment.arrival[6:, 6:]
-    slope = cross @ gamma
-    u = information @ mean + slope
-    gained = jnp.linalg.solve(jnp.eye(6, dtype=P.dtype) + P @ information, P @ u)
-    return (
-        cost
-        + 0.5 * mean @ (information @ mean)
-        + mean @ slope
-        + 0.5 * gamma @ (constant @ gamma)
-        - 0.5 * u @ gained
-    )
+    """f(δ) of Eq. 18: the inner minimum J* over departure, moving samples and the rest that follows.
 
-
-def arrival_sensitivity(
-    delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]
-) -> tuple[Float[Array, "m 6"], Float[Array, "6 6"]]:
-    """Gauss-Newton factors of f at δ: rows ∂[θ, v]/∂δ_i on arrival, and the information M that weighs them.
-
-    The Hessian of f is rows M rowsᵀ up to second derivatives; M = Λ_mm (I + P Λ_mm)⁻¹.
+    Differentiable once, in δ and in all that is condensed.
     """
-    segment = condensed.segment
-    upto, noise, signal = _fill(condensed, delta)
-    state, _, covariance, _ = _arrive(segment, upto, noise, gravity)
-    effects = input_effects(remainders(upto), signal, condensed.period, segment.element, segment.channel)
-    columns = segment.sign[:, None] * effects
-    R = quat_to_matrix(quat_multiply(quat_conjugate(state.q_nb), segment.departure.q_nb))
-    rows = jnp.concatenate([columns[:, :3] @ R.T, columns[:, 6:] @ R.T], axis=1)
-    P = rotate_noise(quat_conjugate(state.q_nb), covariance)[_SEEN][:, _SEEN]
-    information = segment.arrival[:6, :6]
-    weight = jnp.linalg.solve(jnp.eye(6, dtype=P.dtype) + information @ P, information)
-    return rows, 0.5 * (weight + weight.T)
-
-
-def arrivals(
-    samples: Samples,
-    rows: Rows,
-    segment_at: Int[Array, "N"],
-    starts: Bool[Array, "N"],
-    count: int,
-) -> Float[Array, "S 10 10"]:
-    """Λ of each of `count` segments from one pass over the recording (§ arrival of the module's docstring).
-
-    segment_at: the segment whose arrival rest sample k belongs to;
-    starts: first sample of each arrival. The pass is the forward filter from an exactly known, symbolic
-    arrival: its mean is a matrix over [m, γ], so each innovation is a row and Λ the sum of their squares.
-    """
-    eye6, zero3 = jnp.eye(6), jnp.zeros((3, 3))
-    symbolic = jnp.eye(6, 10)
-
-    def step(carry, inputs):
-        q, mean, P, table = carry
-        interval, sample, rest, segment, start = inputs
-        q = jnp.where(start, jnp.array([1.0, 0.0, 0.0, 0.0]), q)
-        mean = jnp.where(start, symbolic, mean)
-        P = jnp.where(start, 0.0, P)
-        gathered = jnp.zeros((10, 10))
-        for index in (3, 4, 5):
-            column = P[:, index]
-            weight = jnp.where(rest, 1.0 / (column[index] + rows.velocity_variance), 0.0)
-            innovation = -mean[index]
-            gathered = gathered + weight * jnp.outer(innovation, innovation)
-            mean = mean + weight * jnp.outer(column, innovation)
-            P = P - weight * jnp.outer(column, column)
-        table = table.at[segment].add(jnp.where(rest, gathered, 0.0))
-        force = quat_rotate(q, interval.velocity)
-        transition = jnp.block([[eye6[:3]], [-skew(force), jnp.eye(3)]])
-        gain = jnp.concatenate(
-            [
-                jnp.zeros((3, 10)),
-                jnp.concatenate([zero3, zero3, -interval.duration * jnp.eye(3), force[:, None]], 1),
-            ]
-        )
-        noise = sample_noise(q, sample.signal, sample.period, sample.variance)[_SEEN][:, _SEEN]
-        return (
-            quat_multiply(q, interval.rotation),
-            transition @ mean + gain,
-            transition @ P @ transition.T + noise,
-            table,
-        ), None
-
-    intervals = sample_intervals(samples.signal, samples.period)
-    carry = (jnp.array([1.0, 0.0, 0.0, 0.0]), symbolic, jnp.zeros((6, 6)), jnp.zeros((count, 10, 10)))
-    (_, _, _, table), _ = jax.lax.scan(
-        step, carry, (intervals, samples, rows.rest & (segment_at >= 0), segment_at, starts)
-    )
-    return table
+    inner, _ = _evaluated_once(*jax.lax.stop_gradient((delta, condensed, gravity)))
+    pulled = _pulled(delta, condensed, gravity, inner)
+    return inner.value + (pulled - jax.lax.stop_gradient(pulled))

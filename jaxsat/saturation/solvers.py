@@ -7,8 +7,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
+
+from jaxsat.inertial.components import Cholesky, Matrix
 
 with warnings.catch_warnings():
     # jaxopt announces on import that it is no longer developed; it is the solver the project is built on.
@@ -42,35 +45,50 @@ class Solution(eqx.Module):
     status: Int[Array, ""]
 
 
+Linearise = Callable[
+    [Float[Array, "n"]], tuple[Float[Array, ""], Float[Array, "n"], tuple[Float[Array, "n"], ...]]
+]
+"""Value, gradient, and the columns of A with A Aᵀ the Gauss-Newton Hessian."""
+
+
+def _assess(linearise: Linearise, u, scale, low, high):
+    """Value, gradient and columns in u = x / scale, and the residual of a bounded stationary point."""
+    value, gradient, columns = linearise(u * scale)
+    gradient = gradient * scale
+    residual = jnp.max(jnp.abs(u - jnp.clip(u - gradient, low, high)))
+    return value, gradient, tuple(column * scale for column in columns), residual
+
+
 # Momentum is dropped after so many steps: acceleration without restarts oscillates about the minimiser.
 _STEPS_PER_ROUND = 120
 
 
 def projected_gradient(
-    fun: Callable[[Float[Array, "n"]], Float[Array, ""]],
+    linearise: Linearise,
     start: Float[Array, "n"],
     lower: Float[Array, "n"],
     upper: Float[Array, "n"],
     scale: Float[Array, "n"],
     tolerance: float | Float[Array, ""],
-    max_iterations: int,
+    max_iterations: int | Int[Array, ""],
 ) -> Solution:
-    """Minimise fun over lower ≤ x ≤ upper by accelerated projected gradient with restarts.
+    """Minimise over lower ≤ x ≤ upper by accelerated projected gradient with restarts.
 
-    scale: the change of each x that moves fun by about ½ (1/√ of the Hessian's diagonal). The search runs in
-    u = x / scale on fun divided by the number of free variables, so curvature is at most about 1 in any direction:
-    `jaxopt.ProjectedGradient` restarts its step at 1 and can stop far from the optimum otherwise. Whether it
-    has arrived is decided by the residual of the solution, not by the solver's own step length.
+    scale: the change of each x that moves the value by about ½ (1/√ of the Hessian's diagonal). The search runs in
+    u = x / scale on the value divided by the number of free variables, so curvature is at most about 1 in any
+    direction: `jaxopt.ProjectedGradient` restarts its step at 1 and can stop far from the optimum otherwise.
+    Whether it has arrived is decided by the residual of the solution, not by the solver's own step length.
     """
     low, high = lower / scale, upper / scale
     share = 1.0 / jnp.maximum(jnp.sum(upper > lower), 1).astype(start.dtype)
 
-    def assess(u):
-        value, gradient = jax.value_and_grad(lambda u: fun(u * scale))(u)
-        return value, jnp.max(jnp.abs(u - jnp.clip(u - gradient, low, high)))
+    def shared(u):
+        value, gradient, _ = linearise(u * scale)
+        return share * value, share * scale * gradient
 
     solver = jaxopt.ProjectedGradient(
-        fun=lambda u: share * fun(u * scale),
+        fun=shared,
+        value_and_grad=True,
         projection=lambda u, box: optax.projections.projection_box(u, *box),
         maxls=15,
     )
@@ -90,7 +108,7 @@ def projected_gradient(
         u, value, error, count, _ = carry
         u_end, state = jax.lax.while_loop(still_moving, one_step, (u, solver.init_state(u, (low, high))))
         u_end = optax.projections.projection_box(u_end, low, high)
-        end_value, end_error = assess(u_end)
+        end_value, _, _, end_error = _assess(linearise, u_end, scale, low, high)
         better = end_value < value
         # In the first round there is nothing to compare with: value is infinite.
         stalled = jnp.isfinite(value) & (value - end_value < 1e-3 * tolerance * (1.0 + jnp.abs(value)))
@@ -104,6 +122,137 @@ def projected_gradient(
     u, value, error, count, stalled = jax.lax.while_loop(
         proceed, one_round, (u, infinite, infinite, jnp.asarray(0), jnp.asarray(False))
     )
+    return _solution(u * scale, value, error, count, stalled, tolerance)
+
+
+def _solution(x, value, error, count, stalled, tolerance) -> Solution:
     unfinished = jnp.where(stalled, Status.STALLED, Status.MAX_ITERATIONS)
     status = jnp.where(error <= tolerance, Status.CONVERGED, unfinished)
-    return Solution(x=u * scale, value=value, residual=error, iterations=count, status=status)
+    return Solution(x=x, value=value, residual=error, iterations=count, status=status)
+
+
+# Damping, relative to a scaled diagonal of 1: where it starts, the least there is, and where a search gives up.
+_DAMPING = (1e-3, 1e-6, 1e6)
+
+
+def projected_gauss_newton(
+    linearise: Linearise,
+    start: Float[Array, "n"],
+    lower: Float[Array, "n"],
+    upper: Float[Array, "n"],
+    scale: Float[Array, "n"],
+    tolerance: float | Float[Array, ""],
+    max_iterations: int | Int[Array, ""],
+) -> Solution:
+    """The same problem by Gauss-Newton steps within the box, damped after Levenberg and Marquardt.
+
+    The Hessian has a low rank, so most directions are free: damping takes the shortest of the steps (in scaled
+    variables) that the data cannot tell apart. One evaluation a step; a step that does not pay is not taken.
+    """
+    low, high = lower / scale, upper / scale
+    first, least, most = _DAMPING
+    rank = len(jax.eval_shape(linearise, start)[2])
+
+    def proceed(carry):
+        _, _, (_, _, _, error), _, damping, count = carry
+        return (error > tolerance) & (count <= max_iterations) & (damping < most)
+
+    def step(carry):
+        # The start is evaluated in the first round, so the objective is compiled once.
+        u, there, at, promised, damping, count = carry
+        value, _, _, error = at
+        new = _assess(linearise, there, scale, low, high)
+        kept = jnp.where(promised > 0.0, (value - new[0]) / jnp.where(promised > 0.0, promised, 1.0), 0.0)
+        # Where the value no longer tells two points apart, the residual does.
+        level = (new[0] - value <= 1e-13 * jnp.abs(value)) & (new[3] < error)
+        better = (count == 0) | ((kept > 1e-4) & (new[0] < value)) | level
+        u, at = jax.tree.map(lambda new, old: jnp.where(better, new, old), (there, new), (u, at))
+        factor = jnp.where((kept > 0.75) | level, 0.1, jnp.where(kept > 0.25, 1.0, 8.0))
+        damping = jnp.where(count == 0, damping, jnp.maximum(damping * factor, least))
+        _, gradient, columns, _ = at
+        there = jnp.clip(u + box_step(gradient, columns, damping, low - u, high - u), low, high)
+        d = there - u
+        promised = -jnp.sum(gradient * d) - 0.5 * sum(jnp.sum(a * d) ** 2 for a in columns)
+        return u, there, at, promised, damping, count + 1
+
+    u = jnp.clip(start / scale, low, high)
+    infinite, zero = jnp.full((), jnp.inf, start.dtype), jnp.zeros((), start.dtype)
+    nothing = (infinite, jnp.zeros_like(u), tuple(jnp.zeros_like(u) for _ in range(rank)), infinite)
+    damping = jnp.full((), first, start.dtype)
+    u, _, (value, _, _, error), _, damping, count = jax.lax.while_loop(
+        proceed, step, (u, u, nothing, zero, damping, jnp.asarray(0))
+    )
+    return _solution(u * scale, value, error, count - 1, damping >= most, tolerance)
+
+
+# Where the slope of a search along a line is looked at: near zero first, since small damping makes kinks there.
+_FRACTIONS = np.concatenate([[0.0], 0.25 ** np.arange(12)[::-1]])
+
+
+def _root(rise: Callable[[Float[Array, "k"]], Float[Array, "k"]], fractions: Float[Array, "k"]):
+    """Where in [0, 1] an increasing, piecewise linear function crosses zero; 1 if it does not."""
+
+    def bracket(points):
+        values = rise(points)
+        after = jnp.clip(jnp.sum(values <= 0.0), 1, len(points) - 1)
+        return points[after - 1], points[after], values[after - 1], values[after]
+
+    low, high, _, _ = bracket(fractions)
+    spread = jnp.linspace(0.0, 1.0, len(fractions), dtype=fractions.dtype)
+    low, high, below, above = bracket(low + (high - low) * spread)
+    crossing = below / jnp.where(above > below, below - above, -1.0)
+    return jnp.where(above <= 0.0, high, low + (high - low) * jnp.clip(crossing, 0.0, 1.0))
+
+
+def box_step(
+    gradient: Float[Array, "n"],
+    columns: tuple[Float[Array, "n"], ...],
+    damping: Float[Array, ""],
+    low: Float[Array, "n"],
+    high: Float[Array, "n"],
+) -> Float[Array, "n"]:
+    """min over low ≤ d ≤ high of gᵀd + ½ |Aᵀd|² + ½ μ |d|², A given by its few columns.
+
+    Its dual has as many variables as A has columns: d(y) = clip(−(g + A y)/μ), and y = Aᵀd(y) is the stationary
+    point of a convex, piecewise quadratic function, found by Newton's method with a line search. An
+    iteration costs a few passes over d and no factorisation larger than the rank.
+    """
+    rank = range(len(columns))
+    fractions = jnp.asarray(_FRACTIONS, gradient.dtype)
+
+    def primal(pull):
+        return jnp.clip(-pull / damping, low, high)
+
+    def newton(carry):
+        y, pull, _, count = carry
+        d = primal(pull)
+        free = (d > low) & (d < high)
+        slope = Matrix.column(y[k] - jnp.sum(columns[k] * d) for k in rank)
+        weighted = [jnp.where(free, column, 0.0) / damping for column in columns]
+        curvature = Matrix(
+            tuple(
+                tuple(jnp.sum(weighted[i] * columns[j]) + (1.0 if i == j else 0.0) for j in rank)
+                for i in rank
+            )
+        ).mirrored()
+        change = [-c for c in Cholesky(curvature).solve(slope).entries()]
+        turned = sum(column * c for column, c in zip(columns, change, strict=True))
+
+        def rise(t):
+            d = primal(pull + t * turned)
+            along = sum((a + t * c) * c for a, c in zip(y, change, strict=True))
+            return along - jnp.sum(turned * d)
+
+        t = _root(jax.vmap(rise), fractions)
+        size = jnp.sqrt(sum(c**2 for c in change)) / (1.0 + jnp.sqrt(sum(a**2 for a in y)))
+        y = tuple(a + t * c for a, c in zip(y, change, strict=True))
+        return y, pull + t * turned, size, count + 1
+
+    def proceed(carry):
+        _, _, size, count = carry
+        return (size > 1e-9) & (count < 50)
+
+    zero = jnp.zeros_like(damping)
+    start = (tuple(zero for _ in rank), gradient, jnp.full_like(damping, jnp.inf), jnp.asarray(0))
+    _, pull, _, _ = jax.lax.while_loop(proceed, newton, start)
+    return primal(pull)
