@@ -2,7 +2,7 @@
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all lint
+.PHONY: demo test test-all lint bench
 demo: $(STAMP)
 	$(VENV)/bin/jaxsat demo
 
@@ -22,3 +22,8 @@ $(STAMP): pyproject.toml
 	$(VENV)/bin/python -m pip install --quiet --upgrade pip
 	$(VENV)/bin/python -m pip install --quiet --editable ".[dev]"
 	touch $@
+
+# The speed board; a few minutes on a quiet machine, with the packages that it compares with.
+bench: $(STAMP)
+	$(VENV)/bin/python -m pip install --quiet --editable ".[bench]"
+	$(VENV)/bin/python scripts/bench.py

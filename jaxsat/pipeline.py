@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ from jaxsat.inertial.smoother import ActiveSet, Rows, Smoothed, smooth, smooth_n
 from jaxsat.inertial.strapdown import NavState, Samples, prefixes, sample_intervals
 from jaxsat.saturation.compensate import Fills, compensate_parallel, compensate_sequential
 from jaxsat.saturation.layout import Trial
-from jaxsat.saturation.methods import Options
+from jaxsat.saturation.methods import Compensation, Options
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording
@@ -133,7 +134,7 @@ def search_options(config: Config, method: str) -> Options:
     """How a compensating method searches."""
     chosen = config.saturation
     return Options(
-        method,
+        cast(Compensation, method),
         chosen.solver,
         chosen.free_peak_time,
         jnp.asarray(chosen.max_iterations),

@@ -147,8 +147,9 @@ def _solve_some(
 ) -> None:
     """Solve the segments `mine`, padded to a bucket of lanes, and record them."""
     lanes = bucket(len(mine), 1)
-    given = (*departures, table[mine], segments.departure[mine], segments.arrival[mine])
-    found, values = _solve(trial, *jax.tree.map(lambda x: pad(x, lanes), given), sizes, options)
+    given = (departures, table[mine], segments.departure[mine], segments.arrival[mine])
+    (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x, lanes), given)
+    found, values = _solve(trial, states, covariances, table, departure, arrival, sizes, options)
     fills.record(trial, mine, found, values)
 
 

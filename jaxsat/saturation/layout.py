@@ -1,6 +1,6 @@
 """From a recording to its segments: which saturated values and gaps belong where, gathered and padded."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ from jaxsat.saturation.gap_shapes import Edges, edge_slope
 from jaxsat.saturation.segment import Segment
 from jaxsat.signals.rests import Segments
 
-Arrays = Array | np.ndarray
+# Arrays of NumPy at the border, of JAX inside; shapes and types are checked, the kind is not.
+Arrays = Any
 
 
 class Trial(eqx.Module):

@@ -1,0 +1,428 @@
+"""The speed board: what things cost, as ratios measured side by side in one run.
+
+    python scripts/bench.py [-o results/bench/cpu.json] [--only NAME ...] [--gate] [--small]
+
+Compilation is apart, times are the shortest of several repeats. 256 trials × 512 samples, 32 saturated gyroscope
+samples each, float64, unless a row says otherwise. `--gate` exits with 1 where a value is worse than the board
+that is there by more than half. `--only` keeps the other rows of that board. `--small` is for a quick look: the
+sweep with a tenth of its trials. Peers come with `pip install 'jaxsat[bench]'`.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import peers
+
+from jaxsat import Sensor, load_config, simulate
+from jaxsat.inertial.smoother import smooth_about
+from jaxsat.pipeline import _smooth, estimate, prepare, search_options
+from jaxsat.saturation.arrival import arrivals
+from jaxsat.saturation.compensate import UNFILLED, arrival_marks, filter_trial, solve_segments
+from jaxsat.saturation.layout import Trial, gather, padded_sizes
+from jaxsat.saturation.segment import condense, value_gradient_root
+from jaxsat.signals.recording import Recording
+from jaxsat.signals.rests import find_segments
+from jaxsat.studies.boards import Row, read_board, worse, write_board
+from jaxsat.studies.motions import Bar, Walk
+from jaxsat.studies.simulate import GRAVITY, Truth, write_simulation
+
+GATE_TOLERANCE = 0.5
+
+
+jax.config.update("jax_enable_x64", True)
+OPTIONS = search_options(load_config(), "direct")
+
+
+# --- Problems ---------------------------------------------------------------------------------------------------
+
+
+class Batch(eqx.Module):
+    """Bar trials of the paper's simulation, each clipped so that as many samples saturate as asked."""
+
+    trials: Trial
+    departure: np.ndarray
+    arrival: np.ndarray
+    segment_at: np.ndarray
+    starts: np.ndarray
+
+
+def with_rests(recording: Recording, truth: Truth) -> Recording:
+    """The recording with its rests as they truly are."""
+    return eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None)
+
+
+@cache
+def bars(trials: int, samples: int = 512, saturated: int = 32) -> Batch:
+    """B trials with noise of their own, leading axis B."""
+    rate = samples / 1.6
+    recording, truth = simulate(Bar(), rate=rate, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
+    prepared = prepare(
+        eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None), load_config()
+    )
+    base = jax.tree.map(np.asarray, prepared.trial)
+    rng = np.random.default_rng(0)
+    signal = base.signal[None] + rng.normal(size=(trials, *base.signal.shape)) * np.sqrt(base.variance)[None]
+    rate_y = np.abs(signal[:, :, 1])
+    rail = np.sort(rate_y, axis=1)[:, -saturated]
+    at = rate_y >= rail[:, None]
+    signal[:, :, 1] = np.where(at, np.sign(signal[:, :, 1]) * rail[:, None], signal[:, :, 1])
+    sign = np.zeros(signal.shape, int)
+    sign[:, :, 1] = np.where(at, np.sign(signal[:, :, 1]), 0)
+    segments = find_segments(prepared.rest)
+    busy = [i for i in range(len(segments)) if at[0, segments.departure[i] + 1 : segments.arrival[i]].any()]
+    assert len(busy) == 1, "the bar moves once"
+    segment_at, starts = arrival_marks(len(base.signal), segments)
+    whole = jax.tree.map(lambda x: np.broadcast_to(x, (trials, *np.shape(x))), base)
+    whole = eqx.tree_at(
+        lambda t: (t.signal, t.sign, t.clean, t.bound),
+        whole,
+        (signal, sign, sign == 0, np.full((trials, 6), 5.0)),
+    )
+    return Batch(whole, segments.departure[busy], segments.arrival[busy], segment_at, starts)
+
+
+def direct(trial: Trial, batch: Batch, whole: bool):
+    """δ of one trial from its arrays: filter to the departure, what the arrival tells, and the search.
+
+    whole: with the filter over the entire trial, as a recording of many segments needs it.
+    """
+    marks = (jnp.asarray(batch.segment_at), jnp.asarray(batch.starts))
+    samples = peers.Samples(trial.signal, trial.period, trial.variance)
+    table = arrivals(samples, trial.rows, *marks, 1)
+    stop = len(trial.period) if whole else int(batch.departure[0]) + 1
+    first = jax.tree.map(lambda x: x[:stop] if np.ndim(x) and len(x) == len(trial.period) else x, trial)
+    states, covariances = filter_trial(first, first.signal, jnp.asarray(UNFILLED))
+    state = jax.tree.map(lambda x: x[batch.departure], states)
+    sizes = padded_sizes(int(batch.arrival[0] - batch.departure[0]), 32, factor=2)
+    return solve_segments(
+        trial, state, covariances[batch.departure], table, batch.departure, batch.arrival, sizes, OPTIONS
+    )
+
+
+def run_direct(batch: Batch, whole: bool) -> Callable:
+    solve = jax.jit(jax.vmap(lambda trial: direct(trial, batch, whole)))
+    trials = jax.device_put(jax.tree.map(jnp.asarray, batch.trials))
+    return lambda: solve(trials)
+
+
+@cache
+def strapdown_seconds(trials: int = 256, samples: int = 512, all_states: bool = True) -> float:
+    signal, initial = peers.bare_trials(trials, samples)
+    return peers.shortest(
+        partial(peers.numba_strapdown, signal, 0.005, initial, GRAVITY, all_states=all_states), 50
+    )
+
+
+def walk(seconds: float, seed: int = 0, rail: float = 5.0):
+    """A foot at 200 Hz with 35 segments in 32 s, each of them saturated."""
+    motion = Walk(strides=round(35 * seconds / 32), swing=0.5, stance=0.36)
+    recording, truth = simulate(
+        motion, rate=200.0, duration=seconds, sensor=Sensor(gyr_rail=rail), key=jax.random.key(seed)
+    )
+    return recording, truth
+
+
+# --- Rows -------------------------------------------------------------------------------------------------------
+
+
+def objective_vs_strapdown() -> Iterator[Row]:
+    batch = bars(256)
+    sizes = padded_sizes(int(batch.arrival[0] - batch.departure[0]), 32, factor=2)
+
+    def segment(trial):
+        samples = peers.Samples(trial.signal, trial.period, trial.variance)
+        table = arrivals(samples, trial.rows, jnp.asarray(batch.segment_at), jnp.asarray(batch.starts), 1)
+        states, covariances = filter_trial(trial, trial.signal, jnp.asarray(UNFILLED))
+        at = batch.departure[0]
+        state = jax.tree.map(lambda x: x[at], states)
+        found, _ = gather(trial, at, batch.arrival[0], state, covariances[at], table[0], sizes)
+        return condense(found)
+
+    condensed = jax.jit(jax.vmap(segment))(jax.tree.map(jnp.asarray, batch.trials))
+    delta = jnp.ones((256, sizes.values))
+    evaluate = jax.jit(jax.vmap(lambda d, c, g: value_gradient_root(d, c, g)[:2], in_axes=(0, 0, None)))
+    bare = strapdown_seconds()
+    seconds = peers.shortest(lambda: evaluate(delta, condensed, jnp.asarray(GRAVITY)), 50)
+    bare = min(bare, strapdown_seconds())
+    last = strapdown_seconds(all_states=False)
+    yield Row(
+        "objective_vs_strapdown", seconds / bare, "1", "lower", 3, 700,
+        f"value and gradient of f(δ): {1e6 * seconds / 131072:.4f} µs per sample; bare pass with all its states "
+        f"{1e6 * bare / 131072:.4f}, with the last one only {1e6 * last / 131072:.4f} (ratio {seconds / last:.2f})",
+    )  # fmt: skip
+
+
+def direct_vs_strapdown() -> Iterator[Row]:
+    bare = strapdown_seconds()
+    batch = bars(256)
+    seconds = peers.shortest(run_direct(batch, False))
+    whole = peers.shortest(run_direct(batch, True))
+    found, _ = run_direct(batch, False)()
+    assert (np.asarray(found.solution.status) == 0).all(), "every search converges"
+    yield Row(
+        "direct_vs_strapdown", seconds / bare, "1", "lower", 100, None,
+        f"filter to the departure, arrival, search to tolerance 1e-2 ({int(found.solution.iterations.max())} steps "
+        f"at most): {1e3 * seconds:.0f} ms a batch; with the filter over the whole trial {1e3 * whole:.0f} ms "
+        f"({whole / bare:.0f})",
+    )  # fmt: skip
+
+
+def estimate_vs_smoother() -> Iterator[Row]:
+    recording, truth = walk(32.0)
+    recording = with_rests(recording, truth)
+    config = load_config(None, method="direct")
+    found = estimate(recording, config)
+    with jax.enable_x64(True):
+        trial = prepare(recording, config).trial
+        smoother = peers.shortest(lambda: _smooth(trial, config)[0].cost)
+    seconds = peers.shortest(lambda: estimate(recording, config).cost)
+    busy = int((found.fills.status != 2).sum())
+    yield Row(
+        "estimate_vs_smoother", seconds / smoother, "1", "lower", 3, None,
+        f"{len(recording)} samples, {busy} segments that saturate: {seconds:.3f} s over {smoother:.3f} s",
+    )  # fmt: skip
+
+
+def paper_way_speedup() -> Iterator[Row]:
+    problem = peers.bar_problem(0)
+    theirs = peers.paper_way(problem)
+    recording, truth = simulate(
+        Bar(), rate=100.0, duration=1.6, sensor=Sensor(gyr_rail=7.5), key=jax.random.key(0)
+    )
+    recording = with_rests(recording, truth)
+    config = load_config(
+        None, **{"saturation.gyr_bound": 5.0, "rails.gyr": 7.5, "smoother.gyr_offset": "none"}
+    )
+    prepared = prepare(recording, config)
+    segment_at, starts = arrival_marks(len(prepared.trial.signal), prepared.segments)
+    batch = Batch(prepared.trial, prepared.segments.departure, prepared.segments.arrival, segment_at, starts)
+    tight = eqx.tree_at(lambda o: o.tolerance, OPTIONS, jnp.asarray(1e-5))
+
+    def solve(trial):
+        samples = peers.Samples(trial.signal, trial.period, trial.variance)
+        table = arrivals(samples, trial.rows, jnp.asarray(segment_at), jnp.asarray(starts), 1)
+        states, covariances = filter_trial(trial, trial.signal, jnp.asarray(0.0))
+        state = jax.tree.map(lambda x: x[batch.departure], states)
+        sizes = padded_sizes(160, 22, factor=2)
+        return solve_segments(
+            trial, state, covariances[batch.departure], table, batch.departure, batch.arrival, sizes, tight
+        )
+
+    run, trial = jax.jit(solve), jax.tree.map(jnp.asarray, prepared.trial)
+    found, values = run(trial)
+    real = np.asarray(values.sample[0]) < len(recording)
+    delta = np.asarray(found.delta[0])[real]
+    cost = peers.dense_objective(problem)(delta)
+    seconds = peers.shortest(lambda: run(trial), 30)
+    yield Row(
+        "paper_way_speedup", theirs.seconds / seconds, "1", "higher", 1000, 1,
+        f"{len(delta)} δ, N = 160: {theirs.seconds:.1f} s and J* = {theirs.cost:.6f} by SLSQP on the dense problem "
+        f"({theirs.evaluations} evaluations), {1e3 * seconds:.2f} ms and J* = {cost:.6f} here",
+    )  # fmt: skip
+
+
+def smoother_vs_peers() -> Iterator[Row]:
+    trials = peers.walking_trials(64, 1000)
+    model = peers.linear_model(trials)
+    gravity = jnp.asarray(GRAVITY)
+
+    @jax.jit
+    def ours():
+        return jax.vmap(
+            lambda reference, samples, rows, prior: smooth_about(
+                reference, samples, rows, prior, trials.prior_covariance, gravity
+            )
+        )(trials.reference, trials.samples, trials.rows, trials.prior)
+
+    seconds = peers.shortest(ours)
+    others = {
+        "dynamax": peers.shortest(peers.dynamax_smoother(model), 3),
+        "cuthbert": min(
+            peers.shortest(peers.cuthbert_smoother(model, variant), 2)
+            for variant in ("moments", "sequential")
+        ),
+    }
+    best = min(others, key=others.__getitem__)
+    yield Row(
+        "smoother_vs_peers", others[best] / seconds, "1", "higher", 3, None,
+        f"64 × 1,000 samples: {seconds:.3f} s; " + ", ".join(f"{k} {v:.3f} s" for k, v in others.items()),
+    )  # fmt: skip
+
+
+def batch_amortisation() -> Iterator[Row]:
+    one, many = (peers.shortest(run_direct(bars(size), False), 10) for size in (1, 1024))
+    yield Row(
+        "batch_amortisation", many / 1024 / one, "1", "lower", 0.05, None,
+        f"direct estimate of a trial: {1e3 * one:.2f} ms alone, {1e3 * many / 1024:.3f} ms among 1,024",
+    )  # fmt: skip
+
+
+def growth() -> Iterator[Row]:
+    def seconds(length):
+        recording, truth = walk(length)
+        recording = with_rests(recording, truth)
+        return peers.shortest(lambda: estimate(recording, load_config(None, method="direct")).cost, 3)
+
+    # Lengths that fill their padded shapes equally well.
+    short, long = seconds(15.36), seconds(8 * 15.36)
+    yield Row(
+        "growth_time", long / short, "1", "lower", 9, None,
+        f"`estimate` with direct: {short:.2f} s for 3,072 samples, {long:.2f} s for 24,576",
+    )  # fmt: skip
+    few, many = (peers.shortest(run_direct(bars(size), False), 10) for size in (128, 1024))
+    yield Row(
+        "growth_batch", many / few, "1", "lower", 8.5, None,
+        f"direct estimate: {1e3 * few:.0f} ms for 128 trials, {1e3 * many:.0f} ms for 1,024",
+    )  # fmt: skip
+
+
+_SWEEP = """
+import dataclasses, resource, sys, time
+import jax, numpy as np
+from jaxsat import Sensor, load_config, simulate, sweep
+from jaxsat.studies.motions import Bar
+from jaxsat.studies import sweep as module
+trials, rails = int(sys.argv[1]), int(sys.argv[2])
+recording, truth = simulate(Bar(), rate=320.0, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
+rng = np.random.default_rng(0)
+recordings = [
+    dataclasses.replace(
+        recording, rest=truth.rest, name=f"bar {i}",
+        gyr=recording.gyr + 1e-3 * rng.normal(size=recording.gyr.shape),
+    )
+    for i in range(trials)
+]
+start = time.perf_counter()
+table = sweep(
+    recordings, load_config(None, **{"saturation.gyr_bound": 5.0}), methods=("direct",),
+    gyr_rails=np.linspace(4.0, 10.0, rails), memory=2e9 - 6e8,
+)
+seconds = time.perf_counter() - start
+assert len(table) == trials * rails
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, seconds, (table.status == "converged").mean())
+"""
+
+
+def sweep_peak(small: bool = False) -> Iterator[Row]:
+    trials = 100 if small else 1000
+    command = [sys.executable, "-c", _SWEEP, str(trials), "16"]
+    peak, seconds, settled = map(
+        float, subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    )
+    yield Row(
+        "sweep_peak_bytes", peak, "B", "lower", 2e9, None,
+        f"{trials} trials × 16 rails × 512 samples, direct: the whole process, {seconds:.0f} s with compilation, "
+        f"{100 * settled:.1f} % of the elements converged",
+    )  # fmt: skip
+
+
+def compilations() -> Iterator[Row]:
+    from jaxsat.studies import sweep as module
+
+    recording, truth = simulate(Bar(), rate=100.0, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
+    recording = with_rests(recording, truth)
+    config, counts = load_config(None, **{"saturation.gyr_bound": 5.0}), []
+    for rails in ([4.0], np.linspace(4.0, 10.0, 32).tolist()):
+        jax.clear_caches()
+        seen: list[str] = []
+
+        def count(event, *_, seen=seen, **values):
+            if event == "/jax/core/compile/backend_compile_duration" and "_scores" in str(values):
+                seen.append(event)
+
+        jax.monitoring.register_event_duration_secs_listener(count)
+        module.sweep([recording], config, methods=("direct",), gyr_rails=rails)
+        jax.monitoring.clear_event_listeners()
+        counts.append(len(seen))
+    yield Row(
+        "compilations_per_bucket", counts[1], "1", "lower", 1, None,
+        f"a sweep of 32 rails; a sweep of one rail: {counts[0]}",
+    )  # fmt: skip
+
+
+def cold_start() -> Iterator[Row]:
+    recording, truth = walk(32.0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_simulation(Path(folder) / "walk", recording, truth, rest=True)
+        environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+        environment["XDG_CACHE_HOME"] = str(Path(folder) / "cache")
+        seconds = []
+        for run in range(3):
+            command = [str(Path(sys.executable).parent / "jaxsat"), "estimate", str(path)]
+            start = time.perf_counter()
+            subprocess.run([*command, "-o", f"{folder}/{run}", "--quiet"], check=True, env=environment)
+            seconds.append(time.perf_counter() - start)
+    what = f"`jaxsat estimate` of a 32 s trial ({len(recording)} samples)"
+    yield Row("cold_first_s", seconds[0], "s", "lower", 40, None, what + ", first run ever")
+    yield Row("cold_later_s", min(seconds[1:]), "s", "lower", 8, None, what + ", later runs")
+
+
+def gpu() -> Iterator[Row]:
+    if jax.default_backend() != "gpu":
+        return
+    batch = bars(10_000)
+    seconds = {}
+    for device in (jax.devices("gpu")[0], jax.devices("cpu")[0]):
+        with jax.default_device(device):
+            part = batch if device.platform == "gpu" else jax.tree.map(lambda x: x, bars(1024))
+            share = 1.0 if device.platform == "gpu" else 10_000 / 1024
+            seconds[device.platform] = share * peers.shortest(run_direct(part, False), 3)
+    yield Row(
+        "gpu_vs_cpu", seconds["cpu"] / seconds["gpu"], "1", "higher", 50, None,
+        f"direct estimate of 10,000 segments at one rail: {seconds['gpu']:.3f} s; CPU {seconds['cpu']:.1f} s "
+        "(extrapolated from 1,024)",
+    )  # fmt: skip
+
+
+PARTS: dict[str, Callable[..., Iterator[Row]]] = {
+    "objective": objective_vs_strapdown,
+    "direct": direct_vs_strapdown,
+    "estimate": estimate_vs_smoother,
+    "paper": paper_way_speedup,
+    "smoother": smoother_vs_peers,
+    "amortisation": batch_amortisation,
+    "growth": growth,
+    "sweep": sweep_peak,
+    "compilations": compilations,
+    "cold": cold_start,
+    "gpu": gpu,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="The speed board")
+    parser.add_argument("-o", "--output", type=Path, default=None)
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--gate", action="store_true", help="exit with 1 where something got worse")
+    parser.add_argument("--small", action="store_true", help="a sweep of a tenth of the trials")
+    arguments = parser.parse_args()
+    output = arguments.output or Path(f"results/bench/{jax.default_backend()}.json")
+    former = read_board(output) if output.exists() else []
+    rows = {row.metric: row for row in former}
+    for name in arguments.only:
+        part = PARTS[name]
+        for row in part(arguments.small) if name == "sweep" else part():
+            print(f"{row.metric}: {row.value:.4g} (goal {row.goal:g}); {row.note}", flush=True)
+            rows[row.metric] = row
+    found = worse(rows.values(), former, GATE_TOLERANCE) if arguments.gate else []
+    for sentence in found:
+        print(sentence, file=sys.stderr)
+    if not found:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        write_board(output, rows.values(), {"tolerance": 1e-2, "dtype": "float64"})
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
