@@ -132,7 +132,7 @@ def _solution(x, value, error, count, stalled, tolerance) -> Solution:
 
 
 # Damping, relative to a scaled diagonal of 1: where it starts, the least there is, and where a search gives up.
-_DAMPING = (1e-3, 1e-6, 1e6)
+_DAMPING = (1.0, 1e-6, 1e6)
 
 
 def projected_gauss_newton(
