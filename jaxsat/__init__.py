@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jaxsat.studies.metrics import position_rmse
     from jaxsat.studies.motions import MOTIONS
     from jaxsat.studies.simulate import Sensor, simulate
+    from jaxsat.studies.sweep import sweep
 
 _HOME = {
     "Config": "jaxsat.config",
@@ -31,6 +32,7 @@ _HOME = {
     "position_rmse": "jaxsat.studies.metrics",
     "read": "jaxsat.signals.readers",
     "simulate": "jaxsat.studies.simulate",
+    "sweep": "jaxsat.studies.sweep",
     "write_results": "jaxsat.present.folder",
 }
 
@@ -47,6 +49,7 @@ __all__ = [  # noqa: RUF022 (the order of _HOME)
     "position_rmse",
     "read",
     "simulate",
+    "sweep",
     "write_results",
 ]
 

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,6 +41,8 @@ AccRail = Annotated[
     str | None,
     typer.Option(help="limit: auto, none or a magnitude in --acc-unit (m/s^2 if not given)", metavar="VALUE"),
 ]
+_CLIP = "limit to clip at: none or a magnitude as for estimate; repeatable"
+Rails = Annotated[list[str] | None, typer.Option(help=_CLIP, metavar="VALUE")]
 RestColumn = Annotated[
     str | None,
     typer.Option(help="auto detects rests; a name takes them from that column (default: rest, if present)"),
@@ -141,6 +144,71 @@ def estimate_command(
         raise typer.Exit(3)
 
 
+@app.command("sweep")
+def sweep_command(
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="files with recordings, one trial each")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
+    gyr_rail: Rails = None,
+    acc_rail: Rails = None,
+    gyr_bound: Annotated[
+        list[float] | None,
+        typer.Option(help="most that a rate exceeds its rail, rad/s; repeatable", metavar="VALUE"),
+    ] = None,
+    acc_bound: Annotated[
+        list[float] | None,
+        typer.Option(help="the same for specific force, m/s²; repeatable", metavar="VALUE"),
+    ] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="standard, direct, triangle or quadratic; repeatable (default: standard and direct)",
+            metavar="NAME",
+        ),
+    ] = None,
+    memory: Annotated[float, typer.Option(help="what the arrays of a call may take", metavar="GB")] = 2.0,
+    config: ConfigPath = None,
+    format: Format = "auto",
+    rate: Rate = None,
+    gyr_unit: GyrUnit = None,
+    acc_unit: AccUnit = None,
+    rests: RestColumn = None,
+    sensor: SensorName = None,
+    negate_acc: NegateAcc = False,
+    csv: Annotated[bool, typer.Option("--csv", help="write CSV instead of Parquet")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing unless something is wrong")] = False,
+) -> None:
+    """Clip recordings at many rails in software, reconstruct them, and tabulate how far off each is."""
+    from jaxsat.config import load_config
+    from jaxsat.present.folder import SWEEP_FILES, check_folder, write_sweep
+    from jaxsat.present.summary import summarise_sweep
+    from jaxsat.present.text import sweep_text
+
+    check_folder(out, SWEEP_FILES)
+    settings = load_config(config)
+    swept = {
+        "methods": method or ["standard", "direct"],
+        "gyr_rails": _swept_rails("gyr", gyr_rail, gyr_unit, acc_unit),
+        "acc_rails": _swept_rails("acc", acc_rail, gyr_unit, acc_unit),
+        "gyr_bounds": gyr_bound or [settings.saturation.gyr_bound],
+        "acc_bounds": acc_bound or [settings.saturation.acc_bound],
+    }
+    _use_compilation_cache()
+    from jaxsat.studies.sweep import sweep_files
+
+    def read(path: Path):
+        return _read(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc)
+
+    started = time.perf_counter()
+    with _progress(quiet) as progress:
+        table = sweep_files(recordings, settings, read=read, memory=memory * 1e9, progress=progress, **swept)
+    summary = summarise_sweep(table, settings, swept, recordings, time.perf_counter() - started)
+    path = write_sweep(table, summary, out, csv=csv)
+    if not quiet:
+        typer.echo(sweep_text(table, path))
+
+
 @app.command("simulate")
 def simulate_command(
     motion: Annotated[str, typer.Argument(metavar="MOTION", help="bar, line, planar or walk")],
@@ -239,23 +307,41 @@ def _read(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc):
 
 def _rails(gyr: str | None, acc: str | None, gyr_unit: str | None, acc_unit: str | None) -> dict[str, Any]:
     """Overrides of the configuration; a magnitude is in the unit that was declared for the file."""
-    from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
-
+    scale = _scales(gyr_unit, acc_unit)
     overrides = {}
-    for name, text, scale in (
-        ("gyr", gyr, ANGULAR_RATE[gyr_unit or "rad/s"]),
-        ("acc", acc, SPECIFIC_FORCE[acc_unit or "m/s^2"]),
-    ):
+    for name, text in (("gyr", gyr), ("acc", acc)):
         if text in ("auto", "none"):
             overrides[f"rails.{name}"] = text
         elif text is not None:
-            try:
-                overrides[f"rails.{name}"] = float(text) * scale
-            except ValueError:
-                raise InputError(
-                    f"--{name}-rail '{text}' is no limit; give auto, none or a number."
-                ) from None
+            overrides[f"rails.{name}"] = _limit(name, text, "auto, none") * scale[name]
     return overrides
+
+
+def _swept_rails(
+    name: str, texts: list[str] | None, gyr_unit: str | None, acc_unit: str | None
+) -> list[float]:
+    """Limits in SI units; infinite where the sensor is left as it is."""
+    scale = _scales(gyr_unit, acc_unit)[name]
+    return [
+        float("inf") if text == "none" else _limit(name, text, "none") * scale for text in texts or ["none"]
+    ]
+
+
+def _scales(gyr_unit: str | None, acc_unit: str | None) -> dict[str, float]:
+    """What a limit is multiplied with to be in SI units; readers complain of unknown units, with the file."""
+    from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
+
+    return {
+        "gyr": ANGULAR_RATE.get(gyr_unit or "rad/s", 1.0),
+        "acc": SPECIFIC_FORCE.get(acc_unit or "m/s^2", 1.0),
+    }
+
+
+def _limit(name: str, text: str, words: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"--{name}-rail '{text}' is no limit; give {words} or a number.") from None
 
 
 def _motion(name: str, duration: float | None):

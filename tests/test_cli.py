@@ -1,5 +1,6 @@
 """The command line end to end: files, exit codes, one line for every error, and silence when asked."""
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -81,6 +82,41 @@ def test_rails_are_in_the_unit_of_the_file(bar, tmp_path, capsys):
     assert found["saturated"]["gyr_y"] == 22
 
 
+def test_a_sweep_writes_its_table_and_a_summary(bar, tmp_path, capsys):
+    out, broken = tmp_path / "out", tmp_path / "broken.csv"
+    broken.write_text("time,gyr_x\n0,1\n")
+    arguments = ["sweep", str(bar), str(broken), "-o", str(out), "--gyr-unit", "rad/s", "--memory", "1"]
+    assert main([*arguments, "--gyr-rail", "7", "--gyr-bound", "5"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == "" and f"failed: {broken}" in printed.out and "1 trial;" in printed.out
+    direct = next(line for line in printed.out.splitlines() if line.startswith("direct"))
+    assert direct.split()[1:3] == ["7", "none"]
+    assert {path.name for path in out.iterdir()} == {"sweep.parquet", "summary.json"}
+    table = pd.read_parquet(out / "sweep.parquet")
+    assert list(table["trial"]) == [str(bar), str(bar), str(broken)]
+    assert list(table["status"]) == ["ignored", "converged", "failed"]
+    assert str(broken) in table["note"].iloc[2]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["swept"]["gyr_rails"] == [7.0] and summary["swept"]["acc_rails"] == ["none"]
+    assert summary["status"] == {"converged": 1, "failed": 1, "ignored": 1}
+    assert summary["inputs"][0]["sha256"] == hashlib.sha256(bar.read_bytes()).hexdigest()
+    assert main(["estimate", str(bar), "-o", str(out)]) == 2, "an estimate does not replace a sweep"
+    assert "sweep.parquet" in capsys.readouterr().err
+
+
+def test_a_quiet_sweep_in_the_unit_of_the_file_writes_csv(bar, tmp_path, capfd):
+    units = tmp_path / "units.csv"
+    table = pd.read_csv(bar)
+    table[["gyr_x", "gyr_y", "gyr_z"]] = np.rad2deg(table[["gyr_x", "gyr_y", "gyr_z"]])
+    table.to_csv(units, index=False)
+    arguments = ["sweep", str(units), "-o", str(tmp_path / "out"), "--method", "standard", "--csv", "--quiet"]
+    assert main([*arguments, "--gyr-unit", "deg/s", "--gyr-rail", "400", "--gyr-rail", "none"]) == 0
+    assert capfd.readouterr() == ("", "")
+    found = pd.read_csv(tmp_path / "out" / "sweep.csv")
+    assert list(found["gyr_rail"]) == pytest.approx([np.deg2rad(400), np.inf])
+    assert found["saturated"].iloc[1] == 22 < found["saturated"].iloc[0]
+
+
 def test_inspect_shows_what_was_clipped(bar, capsys):
     assert main(["inspect", str(bar)]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("gyr_y"))
@@ -134,6 +170,21 @@ def test_bad_input_is_one_line_and_leaves_nothing_behind(name, tmp_path, capfd):
         "estimate BAR -o BAR",
         "estimate BAR -o BAR/below",
         "inspect BAR --format excel",
+        "sweep -o OUT",
+        "sweep BAR",
+        "sweep absent.csv -o OUT",
+        "sweep absent.csv missing.csv -o OUT",
+        "sweep BAR BAR -o OUT",
+        "sweep BAR -o BAR",
+        "sweep BAR -o OUT --method fast",
+        "sweep BAR -o OUT --gyr-rail 0",
+        "sweep BAR -o OUT --gyr-rail auto",
+        "sweep BAR -o OUT --acc-rail -20",
+        "sweep BAR -o OUT --acc-rail 9",
+        "sweep BAR -o OUT --acc-bound 0",
+        "sweep BAR -o OUT --memory 0",
+        "sweep BAR -o OUT --gyr-unit rpm",
+        "sweep BAR -o OUT --config absent.toml",
         "simulate swim -o OUT.csv",
         "simulate bar -o OUT.xlsx",
         "simulate bar -o OUT/absent/bar.csv",

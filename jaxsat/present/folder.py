@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -17,22 +18,28 @@ from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table, signals_table, trajectory_table
 
 _TABLES = {"trajectory": trajectory_table, "signals": signals_table, "gaps": gaps_table}
-_OURS = {
-    "summary.json",
-    "report.html",
-    *(f"{name}.{kind}" for name in _TABLES for kind in ("csv", "parquet")),
-}
+_KINDS = ("csv", "parquet")
+
+ESTIMATE_FILES = frozenset(
+    {"summary.json", "report.html", *(f"{name}.{kind}" for name in _TABLES for kind in _KINDS)}
+)
+SWEEP_FILES = frozenset({"summary.json", *(f"sweep.{kind}" for kind in _KINDS)})
 
 
-def check_folder(folder: Path) -> None:
-    """Raise `InputError` where results cannot go: only a new, an empty or a former result folder is written."""
+def check_folder(folder: Path, files: frozenset[str] = ESTIMATE_FILES) -> None:
+    """Raise `InputError` where results cannot go: only a new, an empty or a former result folder is written.
+
+    files: what results of that kind consist of; those of another kind are not replaced.
+    """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise InputError(f"{folder}: not a folder; choose another name for the results.")
     if folder.is_dir():
         present = {entry.name for entry in folder.iterdir()}
-        if present and not ("summary.json" in present and present <= _OURS):
-            other = min(present - _OURS, default="other files")
-            raise InputError(f"{folder}: holds files that are no results ({other}); choose another folder.")
+        if present and not ("summary.json" in present and present <= files):
+            other = min(present - files, default="other files")
+            raise InputError(
+                f"{folder}: holds files that are no such results ({other}); choose another folder."
+            )
     parent = folder.absolute().parent
     while not parent.exists():
         parent = parent.parent
@@ -55,23 +62,45 @@ def write_results(
     to show, in the report. A former result folder is replaced; raises `InputError` as `check_folder` does.
     """
     folder = Path(folder)
-    with _replaced(folder) as new:
+    with _replaced(folder, ESTIMATE_FILES) as new:
         for name, make in _TABLES.items():
-            table = make(estimate)
-            if csv:
-                table.to_csv(new / f"{name}.csv", index=False)
-            else:
-                table.to_parquet(new / f"{name}.parquet", index=False)
+            _write_table(make(estimate), new, name, csv)
         summary = summarise(estimate, source)
-        (new / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n")
+        _write_summary(summary, new)
         (new / "report.html").write_text(render_report(estimate, summary, beside or {}, scores), "utf-8")
     return folder / "report.html"
 
 
+def write_sweep(
+    table: pd.DataFrame, summary: Mapping[str, Any], folder: str | Path, *, csv: bool = False
+) -> Path:
+    """Write the table of a sweep and its summary; returns the path of the table.
+
+    A former folder of a sweep is replaced; raises `InputError` as `check_folder` does.
+    """
+    folder = Path(folder)
+    with _replaced(folder, SWEEP_FILES) as new:
+        name = _write_table(table, new, "sweep", csv).name
+        _write_summary(summary, new)
+    return folder / name
+
+
+def _write_table(table: pd.DataFrame, folder: Path, name: str, csv: bool) -> Path:
+    if csv:
+        table.to_csv(path := folder / f"{name}.csv", index=False)
+    else:
+        table.to_parquet(path := folder / f"{name}.parquet", index=False)
+    return path
+
+
+def _write_summary(summary: Mapping[str, Any], folder: Path) -> None:
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n")
+
+
 @contextmanager
-def _replaced(folder: Path) -> Iterator[Path]:
+def _replaced(folder: Path, files: frozenset[str]) -> Iterator[Path]:
     """A new folder that takes the place of `folder` when the block ends well, and vanishes otherwise."""
-    check_folder(folder)
+    check_folder(folder, files)
     folder = folder.absolute()
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -2,12 +2,14 @@
 
 import hashlib
 import platform
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import pandas as pd
 
 from jaxsat.config import Config
 from jaxsat.pipeline import Estimate
@@ -35,7 +37,7 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
         "input": {
             "name": estimate.recording.name,
             "file": None if source is None else str(source),
-            "sha256": None if source is None else hashlib.sha256(source.read_bytes()).hexdigest(),
+            "sha256": None if source is None else _hash(source),
             **_extent(estimate.recording),
         },
         "configuration": estimate.config.model_dump(mode="json"),
@@ -63,6 +65,41 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
         "seconds": estimate.seconds,
         "warnings": warnings_of(estimate),
     }
+
+
+def summarise_sweep(
+    table: pd.DataFrame,
+    config: Config,
+    swept: Mapping[str, Sequence[Any]],
+    sources: Sequence[Path],
+    seconds: float,
+) -> dict[str, Any]:
+    """Everything needed to judge and to repeat a sweep, ready for JSON (SI units; an infinite rail is none).
+
+    swept: the values of each parameter; sources: the files of the trials, whose SHA-256 is stored.
+    """
+    return {
+        "versions": _versions(),
+        "inputs": [{"file": str(path), "sha256": _hash(path)} for path in sources],
+        "configuration": config.model_dump(mode="json"),
+        "swept": {
+            name: [
+                "none" if isinstance(value, float) and not np.isfinite(value) else value for value in values
+            ]
+            for name, values in swept.items()
+        },
+        "rows": len(table),
+        "status": {word: int(count) for word, count in table["status"].value_counts().sort_index().items()},
+        "seconds": round(seconds, 3),
+    }
+
+
+def _hash(path: Path) -> str | None:
+    """SHA-256 of a file; None where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
 
 
 def warnings_of(estimate: Estimate) -> list[str]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
@@ -99,3 +100,29 @@ def estimate_text(estimate: Estimate, report: Path) -> str:
         ["report", str(report)],
     ]
     return "\n".join(f"{label:<14}{text}" for label, text in rows)
+
+
+def sweep_text(table: pd.DataFrame, path: Path) -> str:
+    """What `jaxsat sweep` prints: by method and rails, the median path error and how the elements ended."""
+    used, failed = table.query("status != 'failed'"), table.query("status == 'failed'")
+    words = sorted(set(used["status"]))
+    rows = [["method", "gyr rail", "acc rail", "path RMSE", *words]]
+    counted = used.groupby(["method", "gyr_rail", "acc_rail"], sort=False)
+    for labels, rmse in counted["path_rmse"].median().items():
+        method, *rails = labels  # type: ignore[misc]
+        ends = list(counted.get_group(labels)["status"])
+        rows.append(
+            [
+                method,
+                *(f"{rail:.4g}" if np.isfinite(rail) else "none" for rail in rails),
+                f"{rmse:.4g} m",
+                *(str(ends.count(word)) for word in words),
+            ]
+        )
+    lines = [
+        f"{plural(len(set(used['trial'])), 'trial')}; rails in rad/s and m/s²; median path RMSE against the "
+        "recording as given; elements by status",
+        columns(rows),
+    ]
+    lines += [f"failed: {note}" for note in failed["note"]]
+    return "\n".join([*lines, f"table: {path}"])

@@ -1,0 +1,218 @@
+"""The elements of a sweep: one trial clipped at one set of rails, reconstructed by every method, and compared.
+
+`score` works on one element; `run_elements` is the one place where `vmap` runs over many of them.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsat.config import Config
+from jaxsat.inertial.smoother import smooth
+from jaxsat.inertial.strapdown import Samples
+from jaxsat.pipeline import Prepared
+from jaxsat.saturation.compensate import FILLED, UNFILLED, arrival_table, filter_trial, solve_segments
+from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
+from jaxsat.saturation.methods import Options
+from jaxsat.saturation.solvers import Status
+
+# Numbers of eight bytes that a call keeps alive for each sample (and for each further method that compensates), each
+# padded sample of a segment, and each of its padded saturated values; fitted to what XLA reports on a CPU for its
+# arguments, results and temporary arrays.
+_PER_SAMPLE, _PER_METHOD, _PER_MOVING, _PER_VALUE = 450, 200, 75, 110
+
+# How a search can end, from best to worst.
+_SEVERITY = (
+    Status.NOTHING_TO_DO,
+    Status.CONVERGED,
+    Status.NO_ARRIVAL,
+    Status.STALLED,
+    Status.MAX_ITERATIONS,
+)
+
+Scores = dict[str, dict[str, Array]]
+"""Of each method, by the names of columns."""
+
+
+class Case(eqx.Module):
+    """A trial as a sweep holds it: padded to the shapes of its bucket."""
+
+    trial: Trial
+    offset: Float[Arrays, "6"]
+    """What was taken off the signal: rails act on what the sensor reads."""
+    departure: Int[Arrays, "S"]
+    arrival: Int[Arrays, "S"]
+    table: Float[Arrays, "S 10 10"]
+    length: Int[Arrays, ""]
+    path: Float[Arrays, "N 3"]
+    """Of the recording as given, by the standard smoother."""
+
+
+def make_case(prepared: Prepared, busy: Int[np.ndarray, "B"], lanes: int, config: Config) -> Case:
+    """A trial of which the segments `busy` may saturate."""
+    trial, segments = prepared.trial, prepared.segments
+    # Without rows and samples beyond its arrival a padded lane has nothing to solve.
+    table = arrival_table(trial, segments)[busy]
+    path = _standard(trial, jnp.asarray(config.smoother.relinearisations))
+    return Case(
+        trial=jax.tree.map(np.asarray, trial),
+        offset=offset_of(prepared),
+        departure=pad(segments.departure[busy], lanes),
+        arrival=pad(segments.arrival[busy], lanes),
+        table=pad(table, lanes),
+        length=np.asarray(len(prepared.rest)),
+        path=np.asarray(path),
+    )
+
+
+def offset_of(prepared: Prepared) -> Float[np.ndarray, "6"]:
+    """What to add to the signal of the trial for what the sensor read (rad/s, m/s²)."""
+    return np.concatenate([prepared.gyr_offset, np.zeros(3)])
+
+
+def measured(trial: Trial) -> Bool[Arrays, "N 6"]:
+    """Values that were measured, saturated or not."""
+    return trial.clean | (trial.sign != 0)
+
+
+def element_bytes(length: int, lanes: int, sizes: Sizes, compensating: int) -> float:
+    """About what the arrays of one element take, at most.
+
+    length: padded samples of the trial; lanes: segments, of the padded lengths `sizes`; compensating: how many
+    methods other than `standard` there are.
+    """
+    each = _PER_SAMPLE + _PER_METHOD * max(0, compensating - 1)
+    return 8.0 * (length * each + lanes * (sizes.samples * _PER_MOVING + sizes.values * _PER_VALUE))
+
+
+def run_elements(
+    cases: list[Case],
+    values: Float[np.ndarray, "C 4"],
+    sizes: Sizes,
+    options: tuple[Options, ...],
+    config: Config,
+    standard: bool,
+) -> dict[str, dict[str, np.ndarray]]:
+    """The scores of some elements, by method.
+
+    values: gyroscope rail, accelerometer rail and the two bounds of each element.
+    """
+    stacked = jax.tree.map(lambda *x: np.stack(x), *cases)
+    rails, bounds = np.repeat(values[:, :2], 3, axis=1), np.repeat(values[:, 2:], 3, axis=1)
+    found = _scores(
+        stacked,
+        rails,
+        bounds,
+        sizes,
+        options,
+        config.saturation.sweeps,
+        jnp.asarray(config.smoother.relinearisations),
+        standard,
+    )
+    return jax.tree.map(np.asarray, found)
+
+
+@eqx.filter_jit
+def _scores(
+    cases: Case, rails, bounds, sizes: Sizes, options, sweeps: int, relinearisations, standard: bool
+) -> Scores:
+    def one(case, rail, bound):
+        return score(case, rail, bound, sizes, options, sweeps, relinearisations, standard)
+
+    return jax.vmap(one)(cases, rails, bounds)
+
+
+def score(
+    case: Case,
+    rail: Float[Array, "6"],
+    bound: Float[Array, "6"],
+    sizes: Sizes,
+    options: tuple[Options, ...],
+    sweeps: int,
+    relinearisations: Int[Array, ""],
+    standard: bool,
+) -> Scores:
+    """One trial clipped at one set of rails; every method on it."""
+    whole, count = case.trial, len(case.path)
+    raw = whole.signal + case.offset[None]
+    real = jnp.arange(count) < case.length
+    beyond = (jnp.abs(raw) >= rail[None]) & real[:, None]
+    # A value that was not measured does not saturate, whatever was interpolated there.
+    clipped = beyond & measured(whole)
+    # Only a value that did not saturate before is known.
+    known = clipped & whole.clean
+    way = jnp.sign(raw)
+    sign = jnp.where(clipped, way.astype(whole.sign.dtype), whole.sign)
+    signal = jnp.where(beyond, way * rail[None] - case.offset[None], whole.signal)
+    trial = eqx.tree_at(
+        lambda t: (t.signal, t.sign, t.clean, t.bound), whole, (signal, sign, whole.clean & ~clipped, bound)
+    )
+
+    def compared(path, filled):
+        away = jnp.sum((path - case.path) ** 2, axis=1)
+        last = case.length - 1
+        wrong = jnp.sum(jnp.where(known, filled - whole.signal, 0.0).reshape(count, 2, 3) ** 2, axis=(0, 2))
+        missing = jnp.sum(known.reshape(count, 2, 3), axis=(0, 2)).astype(wrong.dtype)
+        fill = jnp.where(missing > 0, jnp.sqrt(wrong / jnp.maximum(missing, 1)), jnp.nan)
+        return {
+            "saturated": jnp.sum(sign != 0),
+            "path_rmse": jnp.sqrt(jnp.sum(jnp.where(real, away, 0.0)) / case.length.astype(away.dtype)),
+            "end_distance": jnp.sqrt(away[last]),
+            **{f"end_{axis}": path[last, i] for i, axis in enumerate("xyz")},
+            **{f"fill_rmse_{sensor}": fill[i] for i, sensor in enumerate(("gyr", "acc"))},
+        }
+
+    found = {}
+    if standard:
+        path = _smooth_path(trial, signal, trial.variance, relinearisations)
+        found["standard"] = compared(path, signal)
+    at = jnp.maximum(case.departure, 0)
+    for option in options:
+
+        def once(filled, share, option=option):
+            states, covariances = jax.tree.map(lambda x: x[at], filter_trial(trial, filled, share))
+            fill, values = solve_segments(
+                trial, states, covariances, case.table, case.departure, case.arrival, sizes, option
+            )
+            place = (values.sample, values.channel)
+            way = sign.at[place].get(mode="fill", fill_value=0)
+            return signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop"), (fill, values)
+
+        # A loop, not a repetition: the program is compiled once.
+        filled, every = jax.lax.scan(once, signal, jnp.asarray([UNFILLED] + [FILLED] * (sweeps - 1)))
+        fill, values = jax.tree.map(lambda x: x[-1], every)
+        path = _smooth_path(trial, filled, trial.variance + trial.fill_variance, relinearisations)
+        busy = jnp.any(values.sample < count, axis=1)
+        order = jnp.asarray([_SEVERITY.index(status) for status in sorted(Status)])
+        worst = jnp.max(jnp.where(busy, order[fill.solution.status], 0))
+        found[option.method] = {
+            **compared(path, filled),
+            "segments": jnp.sum(busy),
+            "status": jnp.asarray(_SEVERITY)[worst],
+            "cost_before": jnp.sum(jnp.where(busy, fill.cost_before, 0.0)),
+            "cost_after": jnp.sum(jnp.where(busy, fill.solution.value, 0.0)),
+            "iterations": jnp.sum(jnp.where(busy, fill.solution.iterations, 0)),
+            "residual": jnp.max(jnp.where(busy, fill.solution.residual, 0.0)),
+            "at_bound": jnp.sum(fill.at_bound),
+        }
+    return found
+
+
+def _smooth_path(trial: Trial, signal, variance, relinearisations) -> Float[Array, "N 3"]:
+    samples = Samples(signal, jnp.asarray(trial.period), variance)
+    smoothed = smooth(
+        samples,
+        trial.rows,
+        trial.prior,
+        jnp.asarray(trial.prior_covariance),
+        jnp.asarray(trial.gravity),
+        relinearisations,
+    )
+    return smoothed.state.position[:-1]
+
+
+@eqx.filter_jit
+def _standard(trial: Trial, relinearisations) -> Float[Array, "N 3"]:
+    return _smooth_path(jax.tree.map(jnp.asarray, trial), trial.signal, trial.variance, relinearisations)

@@ -1,0 +1,257 @@
+"""Many trials at many rails in few calls: each trial is clipped in software, filled again, and compared.
+
+One element is a trial at one gyroscope rail, one accelerometer rail and one pair of bounds; all methods are run on
+it. Elements of trials of about the same length share a compiled program, and `vmap` runs over them in chunks that
+keep to a memory budget. A trial that cannot be used costs one row of the table.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+
+from jaxsat.config import Config
+from jaxsat.errors import InputError
+from jaxsat.pipeline import Prepared, prepare, search_options
+from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
+from jaxsat.saturation.solvers import Status
+from jaxsat.signals.readers import read
+from jaxsat.signals.recording import Recording
+from jaxsat.studies.elements import Case, element_bytes, make_case, measured, offset_of, run_elements
+
+Progress = Callable[[str, int, int], None]
+"""Called with ("sweep", elements done, elements in all)."""
+
+METHODS = ("standard", "direct", "triangle", "quadratic")
+SWEPT = ("gyr_rail", "acc_rail", "gyr_bound", "acc_bound")
+_COUNTS = ("saturated", "segments", "iterations", "at_bound")
+_COLUMNS = (
+    *("trial", "method", *SWEPT, "saturated", "segments", "status", "cost_before", "cost_after"),
+    *("iterations", "residual", "at_bound", "path_rmse", "end_distance", "end_x", "end_y", "end_z"),
+    *("fill_rmse_gyr", "fill_rmse_acc", "note"),
+)
+
+
+def sweep(
+    recordings: Sequence[Recording],
+    config: Config | None = None,
+    *,
+    methods: Sequence[str] = ("standard", "direct"),
+    gyr_rails: Sequence[float] = (np.inf,),
+    acc_rails: Sequence[float] = (np.inf,),
+    gyr_bounds: Sequence[float] | None = None,
+    acc_bounds: Sequence[float] | None = None,
+    memory: float = 2e9,
+    progress: Progress | None = None,
+) -> pd.DataFrame:
+    """Clip every recording at every rail, reconstruct it by every method, and tabulate how it went.
+
+    Rests are those of the recording as given, and so is the path that is compared with. gyr_rails, acc_rails:
+    limits in rad/s and m/s²; infinite leaves a sensor as it is. gyr_bounds, acc_bounds: values of δ_b (default:
+    those of the configuration). memory: what the arrays of a call may take (bytes); one element always runs.
+
+    Returns one row an element and method: `trial` (the name of the recording), `method`, the rails and bounds,
+    `saturated` (values), `segments` (that saturate), `status` (that of the worst segment), `cost_before`,
+    `cost_after`, `iterations`, `residual`, `at_bound`, `path_rmse` and `end_distance` (m, against the path of the
+    recording as given by `standard`), `end_x`…`end_z` (m), `fill_rmse_gyr`, `fill_rmse_acc` (rad/s and m/s², of
+    values clipped in software) and `note`. A recording that cannot be used has one row, with the status `failed`
+    and the reason in `note`. Raises `InputError` for rails, bounds, methods and configurations that cannot be.
+    """
+    plan = _plan(config, methods, gyr_rails, acc_rails, gyr_bounds, acc_bounds, memory)
+    return _sweep([(recording.name, lambda r=recording: r) for recording in recordings], plan, progress)
+
+
+def sweep_files(
+    paths: Sequence[Path],
+    config: Config | None = None,
+    *,
+    read: Callable[[Path], Recording] = read,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> pd.DataFrame:
+    """`sweep` over files, each called by its path as given; one that cannot be read costs one row too.
+
+    read: of one file. settings: those of `sweep`.
+
+    Raises `InputError` also where no file can be used at all.
+    """
+    plan = _plan(config, **settings)
+    named = [(str(path), lambda p=path: replace(read(p), name=str(p))) for path in paths]
+    table = _sweep(named, plan, progress)
+    if set(table["status"]) == {"failed"}:
+        first = table["note"].iloc[0]
+        more = f" (and {len(table) - 1} more recordings that cannot be used)" if len(table) > 1 else ""
+        raise InputError(f"{first}{more}")
+    return table
+
+
+class _Plan(NamedTuple):
+    """What a sweep does, checked."""
+
+    config: Config
+    methods: tuple[str, ...]
+    grid: Float[np.ndarray, "E 4"]
+    """Rails and bounds in the order of `SWEPT`."""
+    memory: float
+
+
+def _plan(
+    config: Config | None,
+    methods: Sequence[str] = ("standard", "direct"),
+    gyr_rails: Sequence[float] = (np.inf,),
+    acc_rails: Sequence[float] = (np.inf,),
+    gyr_bounds: Sequence[float] | None = None,
+    acc_bounds: Sequence[float] | None = None,
+    memory: float = 2e9,
+) -> _Plan:
+    config = config or Config()
+    for method in methods:
+        if method not in METHODS:
+            raise InputError(f"method '{method}' cannot be swept; choose among {', '.join(METHODS)}.")
+    if not len(methods):
+        raise InputError(f"there is no method to sweep; give at least one of {', '.join(METHODS)}.")
+    if config.saturation.segments != "parallel" or config.height.mode == "nonnegative":
+        raise InputError(
+            "a sweep solves segments in parallel and knows no inequality; set saturation.segments to parallel "
+            "and height.mode to off or zero."
+        )
+    if not memory > 0:
+        raise InputError(f"a memory of {memory / 1e9:g} GB cannot be; give a positive number.")
+    limits = config.saturation
+    axes = (
+        _positive(gyr_rails, "a gyroscope rail", np.inf),
+        _positive(acc_rails, "an accelerometer rail", np.inf),
+        _positive([limits.gyr_bound] if gyr_bounds is None else gyr_bounds, "a gyroscope bound"),
+        _positive([limits.acc_bound] if acc_bounds is None else acc_bounds, "an accelerometer bound"),
+    )
+    return _Plan(config, tuple(dict.fromkeys(methods)), np.array(list(itertools.product(*axes))), memory)
+
+
+def _positive(values: Sequence[float], what: str, most: float = np.finfo(float).max) -> list[float]:
+    for value in values:
+        if not 0 < value <= most:
+            raise InputError(f"{what} of {value:g} cannot be; give positive numbers.")
+    if not len(values):
+        raise InputError(f"{what} is missing; give at least one.")
+    return list(dict.fromkeys(float(value) for value in values))
+
+
+def _sweep(
+    named: list[tuple[str, Callable[[], Recording]]], plan: _Plan, progress: Progress | None
+) -> pd.DataFrame:
+    place = {name: i for i, (name, _) in enumerate(named)}
+    if not named:
+        raise InputError("there is no recording to sweep; give at least one.")
+    if len(place) < len(named):
+        twice = next(name for i, (name, _) in enumerate(named) if place[name] != i)
+        raise InputError(f"two recordings are called '{twice}'; give each another name.")
+    with jax.enable_x64(True):
+        # Called in here: the tolerances among them are arrays of double precision.
+        options = tuple(
+            search_options(plan.config, method) for method in plan.methods if method != "standard"
+        )
+        batches, rows = _batches(named, plan)
+        total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
+        for batch in batches:
+            for indices, values, real in _chunks(batch, plan):
+                cases = [batch.cases[i] for i in indices]
+                scores = run_elements(
+                    cases, values, batch.sizes, options, plan.config, "standard" in plan.methods
+                )
+                rows += _rows(scores, [batch.names[i] for i in indices[:real]], values, plan.methods)
+                done += real
+                if progress:
+                    progress("sweep", done, total)
+    rows.sort(key=lambda row: place[row["trial"]])
+    types = {name: "Int64" if name in _COUNTS else "float64" for name in _COLUMNS}
+    types |= dict.fromkeys(("trial", "method", "status", "note"), "string")
+    return pd.DataFrame(rows, columns=pd.Index(_COLUMNS)).astype(types)
+
+
+class _Batch(NamedTuple):
+    """Trials that share a compiled program."""
+
+    cases: list[Case]
+    names: list[str]
+    sizes: Sizes
+    """Of their segments at the lowest rails."""
+
+
+def _batches(named, plan: _Plan) -> tuple[list[_Batch], list[dict[str, Any]]]:
+    """Trials of equal padded length together; and a row for each that cannot be used."""
+    lowest = np.repeat(plan.grid[:, :2].min(axis=0), 3)
+    groups: dict[int, list[tuple[str, Prepared, np.ndarray]]] = {}
+    failed = []
+    for name, load in named:
+        try:
+            prepared = prepare(load(), plan.config)
+            item = name, prepared, _clipped_most(prepared, lowest, name)
+            groups.setdefault(len(prepared.trial.signal), []).append(item)
+        except InputError as error:
+            failed.append({"trial": name, "status": "failed", "note": str(error)})
+    batches = []
+    for items in groups.values():
+        counts = [count_values(sign, prepared.segments) for _, prepared, sign in items]
+        lanes = bucket(max(int((values > 0).sum()) for _, values in counts), 1, factor=2)
+        sizes = padded_sizes(
+            max(int(samples.max(initial=1)) for samples, _ in counts),
+            max(int(values.max(initial=1)) for _, values in counts),
+            factor=2,
+        )
+        cases = [
+            make_case(prepared, np.flatnonzero(values), lanes, plan.config)
+            for (_, prepared, _), (_, values) in zip(items, counts, strict=True)
+        ]
+        batches.append(_Batch(cases, [name for name, _, _ in items], sizes))
+    return batches, failed
+
+
+def _clipped_most(prepared: Prepared, lowest: Float[np.ndarray, "6"], name: str) -> Int[np.ndarray, "N 6"]:
+    """Where the lowest rails saturate; `InputError` where that reaches into rests."""
+    raw = np.asarray(prepared.trial.signal) + offset_of(prepared)
+    resting = np.abs(raw[: len(prepared.rest)][prepared.rest]).max(axis=0)
+    if (resting >= lowest).any():
+        axis = int(np.argmax(resting - lowest))
+        raise InputError(
+            f"{name}: a rail of {lowest[axis]:.4g} {('rad/s', 'm/s²')[axis // 3]} lies within what the sensor reads "
+            f"at rest ({resting[axis]:.4g}); sweep higher rails."
+        )
+    clipped = (np.abs(raw) >= lowest) & np.asarray(measured(prepared.trial))
+    return np.where(clipped, 1, np.asarray(prepared.trial.sign))
+
+
+def _chunks(
+    batch: _Batch, plan: _Plan
+) -> Iterator[tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C 4"], int]]:
+    """Elements, trial after trial, in chunks of one size, and how many are real; the last element is repeated."""
+    case, grid = batch.cases[0], plan.grid
+    compensating = sum(method != "standard" for method in plan.methods)
+    each = element_bytes(len(case.path), len(case.departure), batch.sizes, compensating)
+    count = len(batch.cases) * len(grid)
+    size = int(max(1.0, min(plan.memory / each, count)))
+    for first in range(0, count, size):
+        at = np.minimum(np.arange(first, first + size), count - 1)
+        yield at // len(grid), grid[at % len(grid)], min(size, count - first)
+
+
+def _rows(
+    scores: dict[str, dict[str, np.ndarray]],
+    names: list[str],
+    values: Float[np.ndarray, "C 4"],
+    methods: tuple[str, ...],
+) -> Iterator[dict[str, Any]]:
+    """One row an element and method, elements in order."""
+    for i, name in enumerate(names):
+        for method in methods:
+            found = {column: numbers[i] for column, numbers in scores[method].items()}
+            # The standard smoother searches nothing.
+            idle = "ignored" if found["saturated"] else Status.NOTHING_TO_DO.name.lower()
+            status = Status(found["status"]).name.lower() if "status" in found else idle
+            swept = dict(zip(SWEPT, values[i], strict=True))
+            yield {"trial": name, "method": method, **swept, **found, "status": status}
