@@ -354,7 +354,8 @@ def compilations() -> Iterator[Row]:
 def cold_start() -> Iterator[Row]:
     recording, truth = walk(32.0)
     with tempfile.TemporaryDirectory() as folder:
-        path = write_simulation(Path(folder) / "walk", recording, truth, rest=True)
+        path = Path(folder) / "walk.csv"
+        write_simulation(path, recording, truth, rest=True)
         environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
         environment["XDG_CACHE_HOME"] = str(Path(folder) / "cache")
         seconds = []
