@@ -243,7 +243,7 @@ def test_help_and_version_load_nothing_heavy():
 
 def test_the_compilation_cache_of_the_user_is_respected(monkeypatch, tmp_path):
     script = (
-        "import jax; from jaxsat.cli import _use_compilation_cache as use; use(); "
+        "import jax; from jaxsat.cli.shared import use_compilation_cache as use; use(); "
         "print(jax.config.jax_compilation_cache_dir)"
     )
     for given, expected in (({}, tmp_path / "xdg" / "jaxsat"), ({"JAX_COMPILATION_CACHE_DIR": "/x"}, "/x")):

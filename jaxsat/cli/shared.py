@@ -1,0 +1,109 @@
+"""What the commands share: the application, options, and how recordings, limits and progress are handled."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from jaxsat.errors import InputError
+
+app = typer.Typer(
+    name="jaxsat",
+    help="Trajectories from inertial recordings that saturated.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="file with the recording")]
+Format = Annotated[
+    str, typer.Option(help="format of the recording; auto looks at its content", metavar="NAME")
+]
+Rate = Annotated[float | None, typer.Option(help="sampling rate, for files without time", metavar="HZ")]
+GyrUnit = Annotated[
+    str | None, typer.Option(help="rad/s or deg/s; default: that of the format", metavar="UNIT")
+]
+AccUnit = Annotated[str | None, typer.Option(help="m/s^2 or g; default: that of the format", metavar="UNIT")]
+GyrRail = Annotated[
+    str | None,
+    typer.Option(help="limit: auto, none or a magnitude in --gyr-unit (rad/s if not given)", metavar="VALUE"),
+]
+AccRail = Annotated[
+    str | None,
+    typer.Option(help="limit: auto, none or a magnitude in --acc-unit (m/s^2 if not given)", metavar="VALUE"),
+]
+RestColumn = Annotated[
+    str | None,
+    typer.Option(help="auto detects rests; a name takes them from that column (default: rest, if present)"),
+]
+SensorName = Annotated[
+    str | None, typer.Option(help="which sensor, where a file holds several", metavar="NAME")
+]
+NegateAcc = Annotated[bool, typer.Option("--negate-acc", help="the sensor reports minus the specific force")]
+ConfigPath = Annotated[Path | None, typer.Option(help="TOML file with settings; options override it")]
+
+
+def read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc):
+    import equinox as eqx
+
+    from jaxsat.signals.readers import read
+
+    recording = read(
+        path,
+        format=format,
+        rate=rate,
+        gyr_unit=gyr_unit,
+        acc_unit=acc_unit,
+        rest_column=None if rests == "auto" else rests,
+        sensor=sensor,
+        negate_acc=negate_acc,
+    )
+    # Asked for explicitly, detection goes before a column of the file.
+    if rests == "auto" and recording.rest is not None:
+        recording = eqx.tree_at(lambda r: r.rest, recording, None)
+    return recording
+
+
+def scales(gyr_unit: str | None, acc_unit: str | None) -> dict[str, float]:
+    """What a limit is multiplied with to be in SI units; readers complain of unknown units, with the file."""
+    from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
+
+    return {
+        "gyr": ANGULAR_RATE.get(gyr_unit or "rad/s", 1.0),
+        "acc": SPECIFIC_FORCE.get(acc_unit or "m/s^2", 1.0),
+    }
+
+
+def limit(name: str, text: str, words: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"--{name}-rail '{text}' is no limit; give {words} or a number.") from None
+
+
+def use_compilation_cache() -> None:
+    """Compiled programs are kept between runs, in the user's cache unless JAX was told another place."""
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(base / "jaxsat"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+@contextlib.contextmanager
+def progress_bar(quiet: bool) -> Iterator[Any]:
+    """A progress bar on stderr for people who watch; None otherwise."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("estimating", total=None)
+        yield lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total)

@@ -1,0 +1,102 @@
+"""`jaxsat sweep`: many recordings at many rails."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxsat.cli.shared import (
+    AccUnit,
+    ConfigPath,
+    Format,
+    GyrUnit,
+    NegateAcc,
+    Rate,
+    RestColumn,
+    SensorName,
+    app,
+    limit,
+    progress_bar,
+    read_recording,
+    scales,
+    use_compilation_cache,
+)
+
+_CLIP = "limit to clip at: none or a magnitude as for estimate; repeatable"
+Rails = Annotated[list[str] | None, typer.Option(help=_CLIP, metavar="VALUE")]
+
+
+@app.command("sweep")
+def sweep_command(
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="files with recordings, one trial each")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
+    gyr_rail: Rails = None,
+    acc_rail: Rails = None,
+    gyr_bound: Annotated[
+        list[float] | None,
+        typer.Option(help="most that a rate exceeds its rail, rad/s; repeatable", metavar="VALUE"),
+    ] = None,
+    acc_bound: Annotated[
+        list[float] | None,
+        typer.Option(help="the same for specific force, m/s²; repeatable", metavar="VALUE"),
+    ] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="standard, direct, triangle or quadratic; repeatable (default: standard and direct)",
+            metavar="NAME",
+        ),
+    ] = None,
+    memory: Annotated[float, typer.Option(help="what the arrays of a call may take", metavar="GB")] = 2.0,
+    config: ConfigPath = None,
+    format: Format = "auto",
+    rate: Rate = None,
+    gyr_unit: GyrUnit = None,
+    acc_unit: AccUnit = None,
+    rests: RestColumn = None,
+    sensor: SensorName = None,
+    negate_acc: NegateAcc = False,
+    csv: Annotated[bool, typer.Option("--csv", help="write CSV instead of Parquet")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing unless something is wrong")] = False,
+) -> None:
+    """Clip recordings at many rails in software, reconstruct them, and tabulate how far off each is."""
+    from jaxsat.config import load_config
+    from jaxsat.present.folder import SWEEP_FILES, check_folder, write_sweep
+    from jaxsat.present.summary import summarise_sweep
+    from jaxsat.present.text import sweep_text
+
+    check_folder(out, SWEEP_FILES)
+    settings = load_config(config)
+    swept = {
+        "methods": method or ["standard", "direct"],
+        "gyr_rails": _swept_rails("gyr", gyr_rail, gyr_unit, acc_unit),
+        "acc_rails": _swept_rails("acc", acc_rail, gyr_unit, acc_unit),
+        "gyr_bounds": gyr_bound or [settings.saturation.gyr_bound],
+        "acc_bounds": acc_bound or [settings.saturation.acc_bound],
+    }
+    use_compilation_cache()
+    from jaxsat.studies.sweep import sweep_files
+
+    def read(path: Path):
+        return read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc)
+
+    started = time.perf_counter()
+    with progress_bar(quiet) as progress:
+        table = sweep_files(recordings, settings, read=read, memory=memory * 1e9, progress=progress, **swept)
+    summary = summarise_sweep(table, settings, swept, recordings, time.perf_counter() - started)
+    path = write_sweep(table, summary, out, csv=csv)
+    if not quiet:
+        typer.echo(sweep_text(table, path))
+
+
+def _swept_rails(
+    name: str, texts: list[str] | None, gyr_unit: str | None, acc_unit: str | None
+) -> list[float]:
+    """Limits in SI units; infinite where the sensor is left as it is."""
+    scale = scales(gyr_unit, acc_unit)[name]
+    return [
+        float("inf") if text == "none" else limit(name, text, "none") * scale for text in texts or ["none"]
+    ]
