@@ -159,9 +159,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         # An inequality acts on the whole trajectory only: a single segment is searched without it.
         searched = trial
         if config.height.mode == "nonnegative":
-            searched = eqx.tree_at(
-                lambda t: (t.rows.height, t.heights), trial, (np.zeros(len(trial.period), bool), False)
-            )
+            searched = eqx.tree_at(lambda t: t.rows.height, trial, None)
         if config.saturation.segments == "parallel":
             fills = compensate_parallel(searched, segments, options, config.saturation.sweeps, report)
         else:
@@ -265,14 +263,15 @@ def _trial(
     # Tilt is horizontal in the navigation frame; heading and position are the origin of the map.
     prior_covariance = np.diag([tilt, tilt, 0.0, 0.0, 0.0, 0.0, speed, speed, speed])
 
-    height = np.zeros(n, bool)
+    height = None
     if config.height.mode != "off":
+        height = np.zeros(n, bool)
         arrivals = np.flatnonzero(rest[1:] & ~rest[:-1]) + 1
         height[arrivals[arrivals > first]] = True
     rows = Rows(
         rest=jnp.asarray(rest),
         velocity_variance=jnp.asarray(noise.rest_velocity_sd**2),
-        height=jnp.asarray(height),
+        height=None if height is None else jnp.asarray(height),
         height_variance=jnp.asarray(config.height.sd**2),
     )
     trial = Trial(
@@ -286,7 +285,6 @@ def _trial(
         prior=jax.tree.map(np.asarray, NavState(q_nb, velocity, jnp.zeros(3))),
         prior_covariance=prior_covariance,
         gravity=np.asarray(gravity),
-        heights=config.height.mode != "off",
     )
     return trial.padded(), offset
 

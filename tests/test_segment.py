@@ -21,9 +21,7 @@ REST = np.arange(N) >= MOVING
 
 
 def arrival_table():
-    start = np.arange(N) == MOVING
-    where = jnp.asarray(np.where(REST, 0, -1))
-    return jax.jit(arrivals, static_argnums=4)(SAMPLES, problems.rows(REST), where, jnp.asarray(start), 1)
+    return jax.jit(arrivals)(SAMPLES, problems.rows(REST), jnp.array([MOVING]), jnp.array([N]), RESTING)
 
 
 def build(height: bool, departure=None) -> Segment:

@@ -7,7 +7,15 @@ import numpy as np
 import problems
 import pytest
 
-from jaxsat.inertial.smoother import HEIGHT, VELOCITY, closed_loop, smooth, smooth_about, smooth_nonnegative
+from jaxsat.inertial.smoother import (
+    HEIGHT,
+    VELOCITY,
+    Rows,
+    closed_loop,
+    smooth,
+    smooth_about,
+    smooth_nonnegative,
+)
 from jaxsat.inertial.strapdown import (
     NavState,
     add_error,
@@ -74,6 +82,22 @@ def dense(reference, samples, rows, prior, prior_covariance, extra_rows=None):
         0.5 * innovation @ np.linalg.solve(S, innovation),
         np.linalg.solve(S, innovation),
     )
+
+
+def test_without_heights_only_the_position_of_the_filter_changes():
+    """What no row sees is left out of the filter; the smoother still knows all of it."""
+    rows = problems.rows(REST)
+    unused = Rows(rows.rest, rows.velocity_variance, None, rows.height_variance)
+    prior, covariance = problems.departure()
+    full, small = (closed_loop(SAMPLES, r, prior, covariance, problems.GRAVITY) for r in (rows, unused))
+    motion = np.array([0, 1, 2, 6, 7, 8])
+    np.testing.assert_allclose(small[1], full[1][:, motion][:, :, motion], rtol=1e-9, atol=1e-16)
+    np.testing.assert_allclose(small[0].q_nb, full[0].q_nb, atol=1e-12)
+    np.testing.assert_allclose(small[0].velocity, full[0].velocity, atol=1e-12)
+    full, small = (SMOOTH(SAMPLES, r, prior, covariance, problems.GRAVITY) for r in (rows, unused))
+    np.testing.assert_allclose(small.state.position, full.state.position, atol=1e-9)
+    np.testing.assert_allclose(small.covariance, full.covariance, rtol=1e-8, atol=1e-13)
+    assert small.cost == pytest.approx(float(full.cost), rel=1e-9) and small.height_multiplier is None
 
 
 @pytest.mark.parametrize("exact_start", [False, True])

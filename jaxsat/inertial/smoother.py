@@ -5,6 +5,9 @@ adjoint; its minimum J* comes out of the forward pass alone. Rows: zero velocity
 height row at the first sample of each rest, as an equality with a given sd or as the inequality z ≥ 0.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,10 +36,15 @@ class Rows(eqx.Module):
     """Zero velocity at state k."""
     velocity_variance: Float[Array, ""]
     """Of each axis at rest (m²/s²)."""
-    height: Bool[Array, "N"]
-    """Zero height at state k."""
+    height: Bool[Array, "N"] | None
+    """Zero height at state k; None where heights are not used at all."""
     height_variance: Float[Array, ""]
     """Of a height row (m²); zero makes it exact."""
+
+    def marked(self, change: Callable[[Any], Any]) -> "Rows":
+        """With the flags of rests and heights changed alike."""
+        height = None if self.height is None else jnp.asarray(change(self.height))
+        return Rows(jnp.asarray(change(self.rest)), self.velocity_variance, height, self.height_variance)
 
 
 class Smoothed(eqx.Module):
@@ -47,63 +55,72 @@ class Smoothed(eqx.Module):
     """Of [θ, r, v], θ in the navigation frame."""
     cost: Float[Array, ""]
     """J*, the minimum of Eq. 14."""
-    height_multiplier: Float[Array, "N"]
+    height_multiplier: Float[Array, "N"] | None
     """dJ*/dz of each height row; zero where there is none."""
 
 
+def _observed(rows: Rows, size: int) -> tuple[int, ...]:
+    """Where the observed rows stand in a state with or without position: velocity, then height."""
+    first = size - 3
+    return (first, first + 1, first + 2, *(() if rows.height is None else (HEIGHT,)))
+
+
 def update_rows(
-    mean: Float[Array, "9"],
-    covariance: Float[Array, "9 9"],
+    mean: Float[Array, "n"],
+    covariance: Float[Array, "n n"],
     state: NavState,
     rows: Rows,
     rest: Bool[Array, ""],
-    height: Bool[Array, ""],
-) -> tuple[Float[Array, "9"], Float[Array, "9 9"], Float[Array, ""], list[kalman.Row]]:
+    height: Bool[Array, ""] | None,
+) -> tuple[Float[Array, "n"], Float[Array, "n n"], Float[Array, ""], list[kalman.Row]]:
     """The rows of one state on the error about the reference `state`; rest, height: its flags in `rows`."""
     cost, done = jnp.zeros_like(state.velocity[0]), []
-    for axis, index in enumerate(VELOCITY):
-        mean, covariance, extra, row = kalman.update_row(
-            mean, covariance, index, -state.velocity[axis], rows.velocity_variance, rest
-        )
-        cost, done = cost + extra, [*done, row]
-    mean, covariance, extra, row = kalman.update_row(
-        mean, covariance, HEIGHT, -state.position[2], rows.height_variance, height
-    )
-    return mean, covariance, cost + extra, [*done, row]
+    known = [(-v, rows.velocity_variance, rest) for v in state.velocity]
+    if height is not None:
+        known.append((-state.position[2], rows.height_variance, height))
+    for index, row in zip(_observed(rows, len(mean)), known, strict=True):
+        mean, covariance, extra, done_row = kalman.update_row(mean, covariance, index, *row)
+        cost, done = cost + extra, [*done, done_row]
+    return mean, covariance, cost, done
 
 
 def closed_loop(
     samples: Samples,
     rows: Rows,
     prior: NavState,
-    prior_covariance: Float[Array, "9 9"],
+    prior_covariance: Float[Array, "p p"],
     gravity: Float[Array, ""],
-) -> tuple[NavState, Float[Array, "N1 9 9"]]:
+) -> tuple[NavState, Float[Array, "N1 n n"]]:
     """Extended Kalman filter: strapdown that is corrected at each row.
 
-    Returns the N+1 corrected states and their filtered covariances; they
-    are the reference of the smoother's first linearisation and the departure of each segment (Section 5).
+    Returns the N+1 corrected states and their filtered covariances. They are the reference of the smoother's first
+    linearisation and the departure of each segment (Section 5). Covariances, the prior's too, are of [θ, r, v] or,
+    where no height is observed, of [θ, v]: position is then integrated, not corrected.
     """
+    size = 6 if rows.height is None else 9
+
+    def part(matrix):
+        if len(matrix) == size:
+            return matrix
+        corner = [[matrix[i : i + 3, j : j + 3] for j in (0, 6)] for i in (0, 6)]
+        return jnp.block(corner)
 
     def step(carry, inputs):
         state, covariance = carry
         interval, sample, rest, height = inputs
-        mean, covariance, _, _ = update_rows(
-            jnp.zeros(9, covariance.dtype), covariance, state, rows, rest, height
-        )
-        state = add_error(state, mean)
-        _, predicted = kalman.predict(
-            mean,
-            covariance,
-            error_transition(state.q_nb, interval),
-            jnp.zeros_like(mean),
-            sample_noise(state.q_nb, sample.signal, sample.period, sample.variance),
-        )
+        nothing = jnp.zeros(size, covariance.dtype)
+        mean, covariance, _, _ = update_rows(nothing, covariance, state, rows, rest, height)
+        unseen = jnp.zeros(9 - size, mean.dtype)
+        state = add_error(state, jnp.concatenate([mean[:3], unseen, mean[3:]]))
+        transition = part(error_transition(state.q_nb, interval))
+        noise = part(sample_noise(state.q_nb, sample.signal, sample.period, sample.variance))
+        spread = kalman.product(kalman.product(transition, covariance), transition.T) + noise
+        predicted = 0.5 * (spread + spread.T)
         return (advance(state, interval, gravity), predicted), (state, covariance)
 
     intervals = sample_intervals(samples.signal, samples.period)
     last, corrected = jax.lax.scan(
-        step, (prior, prior_covariance), (intervals, samples, rows.rest, rows.height)
+        step, (prior, part(prior_covariance)), (intervals, samples, rows.rest, rows.height)
     )
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last)
 
@@ -143,9 +160,10 @@ def smooth_about(
         state, interval, mean, covariance, row = inputs
         adjoint = kalman.adjoint_transition(adjoint, error_transition(state.q_nb, interval))
         smoothed = kalman.condition_on_future(mean, covariance, adjoint)
-        adjoint, multiplier = kalman.adjoint_row(adjoint, HEIGHT, row[-1])
-        for index, velocity_row in reversed(list(zip(VELOCITY, row[:-1], strict=True))):
-            adjoint, _ = kalman.adjoint_row(adjoint, index, velocity_row)
+        multiplier = None
+        for index, done in reversed(list(zip(_observed(rows, 9), row, strict=True))):
+            adjoint, pull = kalman.adjoint_row(adjoint, index, done)
+            multiplier = pull if index == HEIGHT else multiplier
         return adjoint, (*smoothed, multiplier)
 
     initial_error = error_between(prior, jax.tree.map(lambda x: x[0], reference))
@@ -211,12 +229,14 @@ def smooth_nonnegative(
     are ≥ 0 and each row is complementary: the solution of the quadratic problem with the inequality of Section 3.
     """
     candidates = rows.height
+    assert candidates is not None, "there are heights to keep"
     zero = jnp.zeros_like(gravity)
 
     def solve(active):
         exact = Rows(rows.rest, rows.velocity_variance, active, zero)
         smoothed = smooth(samples, exact, prior, prior_covariance, gravity, relinearisations)
         low = smoothed.state.position[:-1, 2] < -tolerance
+        assert smoothed.height_multiplier is not None
         wanted = candidates & jnp.where(active, smoothed.height_multiplier > 0.0, low)
         return smoothed, wanted
 

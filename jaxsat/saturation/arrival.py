@@ -7,11 +7,11 @@ do. With m = [θ, v̂ + v_e] and γ = [g; 1] in that frame the rows of the rest 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial.rotations import quat_multiply, quat_rotate, skew
 from jaxsat.inertial.smoother import Rows
-from jaxsat.inertial.strapdown import Samples, sample_intervals, sample_noise
+from jaxsat.inertial.strapdown import Samples, sample_interval, sample_noise
 
 # Position is not seen by a velocity row, so the arrival speaks of [θ, v] only.
 _SEEN = np.array([0, 1, 2, 6, 7, 8])
@@ -20,53 +20,46 @@ _SEEN = np.array([0, 1, 2, 6, 7, 8])
 def arrivals(
     samples: Samples,
     rows: Rows,
-    segment_at: Int[Array, "N"],
-    starts: Bool[Array, "N"],
-    count: int,
+    start: Int[Array, "S"],
+    end: Int[Array, "S"],
+    longest: Int[Array, ""] | int,
 ) -> Float[Array, "S 10 10"]:
-    """Λ of each of `count` segments from one pass over the recording.
+    """Λ of each arrival, whose rest samples are [start, end); zeros where there are none.
 
-    segment_at: the segment whose arrival rest sample k belongs to;
-    starts: first sample of each arrival. The pass is the forward filter from an exactly known, symbolic
-    arrival: its mean is a matrix over [m, γ], so each innovation is a row and Λ the sum of their squares.
+    longest: of the rests, in samples. All rests are passed side by side by the forward filter from an exactly
+    known, symbolic arrival: its mean is a matrix over [m, γ], so each innovation is a row and Λ the sum of
+    their squares.
     """
-    eye6, zero3 = jnp.eye(6), jnp.zeros((3, 3))
-    symbolic = jnp.eye(6, 10)
+    count = len(samples.period)
 
-    def step(carry, inputs):
+    def one(carry, at, end):
         q, mean, P, table = carry
-        interval, sample, rest, segment, start = inputs
-        q = jnp.where(start, jnp.array([1.0, 0.0, 0.0, 0.0]), q)
-        mean = jnp.where(start, symbolic, mean)
-        P = jnp.where(start, 0.0, P)
-        gathered = jnp.zeros((10, 10))
+        here = jnp.minimum(at, count - 1)
+        signal, period, variance = (x[here] for x in (samples.signal, samples.period, samples.variance))
+        rest = (at < end) & rows.rest[here]
         for index in (3, 4, 5):
             column = P[:, index]
             weight = jnp.where(rest, 1.0 / (column[index] + rows.velocity_variance), 0.0)
             innovation = -mean[index]
-            gathered = gathered + weight * jnp.outer(innovation, innovation)
+            table = table + weight * jnp.outer(innovation, innovation)
             mean = mean + weight * jnp.outer(column, innovation)
             P = P - weight * jnp.outer(column, column)
-        table = table.at[segment].add(jnp.where(rest, gathered, 0.0))
+        interval = sample_interval(signal, period)
         force = quat_rotate(q, interval.velocity)
-        transition = jnp.block([[eye6[:3]], [-skew(force), jnp.eye(3)]])
-        gain = jnp.concatenate(
+        lift = -skew(force)
+        # Φ = [[I, 0], [−[F×], I]], row by row.
+        fallen = jnp.concatenate([jnp.zeros((3, 6)), -period * jnp.eye(3), force[:, None]], axis=1)
+        mean = jnp.concatenate([mean[:3], mean[3:] + lift @ mean[:3] + fallen])
+        top, below = P[:3], P[3:] + lift @ P[:3]
+        P = jnp.concatenate(
             [
-                jnp.zeros((3, 10)),
-                jnp.concatenate([zero3, zero3, -interval.duration * jnp.eye(3), force[:, None]], 1),
+                jnp.concatenate([top[:, :3], top[:, 3:] + top[:, :3] @ lift.T], axis=1),
+                jnp.concatenate([below[:, :3], below[:, 3:] + below[:, :3] @ lift.T], axis=1),
             ]
         )
-        noise = sample_noise(q, sample.signal, sample.period, sample.variance)[_SEEN][:, _SEEN]
-        return (
-            quat_multiply(q, interval.rotation),
-            transition @ mean + gain,
-            transition @ P @ transition.T + noise,
-            table,
-        ), None
+        P = P + sample_noise(q, signal, period, variance)[_SEEN][:, _SEEN]
+        return quat_multiply(q, interval.rotation), mean, P, table
 
-    intervals = sample_intervals(samples.signal, samples.period)
-    carry = (jnp.array([1.0, 0.0, 0.0, 0.0]), symbolic, jnp.zeros((6, 6)), jnp.zeros((count, 10, 10)))
-    (_, _, _, table), _ = jax.lax.scan(
-        step, carry, (intervals, samples, rows.rest & (segment_at >= 0), segment_at, starts)
-    )
-    return table
+    blank = (jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.eye(6, 10), jnp.zeros((6, 6)), jnp.zeros((10, 10)))
+    lanes = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(start), *x.shape)), blank)
+    return jax.lax.fori_loop(0, longest, lambda k, c: jax.vmap(one)(c, start + k, end), lanes)[3]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsat.inertial.smoother import Rows, closed_loop
+from jaxsat.inertial.smoother import closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.layout import (
@@ -80,7 +80,7 @@ class Fills(eqx.Module):
 
 def filter_trial(
     trial: Trial, signal: Float[Arrays, "N 6"], share: Float[Arrays, ""]
-) -> tuple[NavState, Float[Array, "N1 9 9"]]:
+) -> tuple[NavState, Float[Array, "N1 s s"]]:
     """The departures of all segments: one filter pass over the recording with a filled signal.
 
     Methods 1 and 2 do not say how sure they are of a filled value, so each enters with `share` times the variance
@@ -98,7 +98,7 @@ UNFILLED, FILLED = 4.0, 1.0
 def solve_segments(
     trial: Trial,
     states: NavState,
-    covariances: Float[Arrays, "L 9 9"],
+    covariances: Float[Arrays, "L s s"],
     table: Float[Arrays, "L 10 10"],
     departure: Int[Arrays, "L"],
     arrival: Int[Arrays, "L"],
@@ -119,27 +119,23 @@ _solve = eqx.filter_jit(solve_segments)
 
 
 @eqx.filter_jit
-def _arrivals(signal, period, variance, rows: Rows, segment_at, starts, count: int):
-    return arrivals(Samples(signal, period, variance), rows, segment_at, starts, count)
-
-
-def arrival_marks(count: int, segments: Segments) -> tuple[Int[np.ndarray, "N"], Bool[np.ndarray, "N"]]:
-    """The segment that each rest sample is the arrival of (-1 for none), and the first samples of arrivals."""
-    segment_at, starts = np.full(count, -1), np.zeros(count, bool)
-    for index, (start, end) in enumerate(zip(segments.arrival, segments.rest_end, strict=True)):
-        # A segment without a departure has no known start, so its arrival tells nothing about it.
-        if segments.departure[index] >= 0:
-            segment_at[start:end] = index
-            starts[start : start + 1] = True
-    return segment_at, starts
+def _arrivals(trial: Trial, start, end, longest):
+    return arrivals(Samples(trial.signal, trial.period, trial.variance), trial.rows, start, end, longest)
 
 
 def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 10"]:
     """Λ of every segment's arrival; zeros where no rest follows. Independent of δ: rests do not saturate."""
-    marks = arrival_marks(len(trial.signal), segments)
-    count = bucket(len(segments), 16)
-    table = _arrivals(trial.signal, trial.period, trial.variance, trial.rows, *marks, count)
-    return np.asarray(table)[: len(segments)]
+    # A segment without a departure has no known start, so its arrival tells nothing about it.
+    length = np.where(segments.departure >= 0, segments.rest_end - segments.arrival, 0)
+    table = np.zeros((len(segments), 10, 10))
+    # Rests of like length side by side: all wait for the longest.
+    order = np.argsort(length)
+    for first in range(0, len(order), LANES):
+        mine = order[first : first + LANES]
+        lanes = bucket(len(mine), 1)
+        start, steps = pad(segments.arrival[mine], lanes), pad(length[mine], lanes)
+        table[mine] = np.asarray(_arrivals(trial, start, start + steps, steps.max()))[: len(mine)]
+    return table
 
 
 def _solve_some(
@@ -216,11 +212,7 @@ def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, st
         return pad(np.asarray(x)[start : stop + 1], size)
 
     fresh = np.arange(size) >= (0 if start == 0 else 1)
-    rows = eqx.tree_at(
-        lambda r: (r.rest, r.height),
-        trial.rows,
-        (span(trial.rows.rest) & fresh, span(trial.rows.height) & fresh),
-    )
+    rows = trial.rows.marked(lambda flags: span(flags) & fresh)
     part = Trial(
         signal=span(trial.signal),
         period=span(trial.period),
@@ -232,7 +224,6 @@ def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, st
         prior=state,
         prior_covariance=covariance,
         gravity=trial.gravity,
-        heights=trial.heights,
     )
     states, covariances = _filter(part, span(signal), np.asarray(FILLED))
     return jax.tree.map(lambda x: np.asarray(x[count - 1]), states), np.asarray(covariances[count - 1])

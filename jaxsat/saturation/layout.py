@@ -31,10 +31,8 @@ class Trial(eqx.Module):
     """δ_b of each channel."""
     rows: Rows
     prior: NavState
-    prior_covariance: Float[Arrays, "9 9"]
+    prior_covariance: Float[Arrays, "p p"]
     gravity: Float[Arrays, ""]
-    heights: bool = eqx.field(static=True)
-    """Whether f(δ) takes height rows into account."""
 
     @property
     def fill_variance(self) -> Float[Arrays, "N 6"]:
@@ -49,11 +47,7 @@ class Trial(eqx.Module):
             # 256, 384, 512, 768, …: a third is wasted at most.
             size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
         extra = {name: pad(np.asarray(getattr(self, name)), size) for name in _SAMPLED}
-        rows = eqx.tree_at(
-            lambda r: (r.rest, r.height),
-            self.rows,
-            (pad(np.asarray(self.rows.rest), size), pad(np.asarray(self.rows.height), size)),
-        )
+        rows = self.rows.marked(lambda flags: pad(np.asarray(flags), size))
         return eqx.tree_at(
             lambda t: (*(getattr(t, name) for name in _SAMPLED), t.rows), self, (*extra.values(), rows)
         )
@@ -108,7 +102,7 @@ def gather(
     departure: Int[Array, ""],
     arrival: Int[Array, ""],
     state: NavState,
-    covariance: Float[Array, "9 9"],
+    covariance: Float[Array, "s s"],
     table: Float[Array, "10 10"],
     sizes: Sizes,
 ) -> tuple[Segment, Values]:
@@ -135,7 +129,7 @@ def gather(
     sample, channel = jnp.where(valid, place // 6, 0), jnp.where(valid, place % 6, 0)
     gap, edges = _gaps(trial, signal, sign, start, sample, channel, valid, m)
     height = None
-    if trial.heights:
+    if trial.rows.height is not None:
         height = (arrival < count) & jnp.asarray(trial.rows.height)[jnp.minimum(arrival, count - 1)]
     segment = Segment(
         signal=signal,

@@ -56,7 +56,8 @@ class Segment(eqx.Module):
     """Edges of each gap, time in samples of the segment; padded."""
     departure: NavState
     """State at the start of sample 0."""
-    departure_covariance: Float[Array, "9 9"]
+    departure_covariance: Float[Array, "s s"]
+    """Of [θ, r, v], or of [θ, v] where heights are not used."""
     arrival: Float[Array, "10 10"]
     """Λ over [m (6), γ (4)]; zeros where no rest follows."""
     height: Bool[Array, ""] | None
@@ -116,8 +117,11 @@ def condense(segment: Segment) -> Condensed:
 
     to_body = Quaternion.of(segment.departure.q_nb).conjugate()
     R = Matrix.block([[to_body.matrix()]])
-    P = Matrix.of(segment.departure_covariance[_POSITION_LAST][:, _POSITION_LAST])
+    P = segment.departure_covariance
+    if len(P) == 9:
+        P = P[_POSITION_LAST][:, _POSITION_LAST]
     size = 9 if position else 6
+    P = Matrix.of(P[:size, :size])
     values, vectors = jnp.linalg.eigh(segment.arrival[:6, :6])
     one = jnp.ones_like(segment.height_variance)
     variance = pick(segment.variance)
@@ -132,7 +136,7 @@ def condense(segment: Segment) -> Condensed:
         velocity=to_body.rotate(Vector.of(segment.departure.velocity)),
         height=segment.departure.position[2],
         up=R(Vector(0.0, 0.0, one)),
-        covariance=_turned(R, _turned(R, P.part(slice(size), slice(size))).T).mirrored(),
+        covariance=_turned(R, _turned(R, P).T).mirrored(),
         arrival=Matrix.of(segment.arrival),
         root=Matrix.of(vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]),
         height_row=None if segment.height is None else (segment.height, segment.height_variance),
