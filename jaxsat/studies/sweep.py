@@ -9,14 +9,14 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from jaxsat.config import Config
+from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
 from jaxsat.pipeline import Prepared, prepare, search_options
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
@@ -28,7 +28,7 @@ from jaxsat.studies.elements import Case, element_bytes, make_case, measured, of
 Progress = Callable[[str, int, int], None]
 """Called with ("sweep", elements done, elements in all)."""
 
-METHODS = ("standard", "direct", "triangle", "quadratic")
+METHODS: tuple[str, ...] = get_args(Method)
 SWEPT = ("gyr_rail", "acc_rail", "gyr_bound", "acc_bound")
 _COUNTS = ("saturated", "segments", "iterations", "at_bound")
 _COLUMNS = (
