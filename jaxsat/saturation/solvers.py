@@ -31,7 +31,8 @@ class Status(enum.IntEnum):
     NO_ARRIVAL = 3
     """No rest follows, so the data say nothing; the start is returned."""
     STALLED = 4
-    """A whole round lowered the value by less than a thousandth of the tolerance (relative): a kink, mostly."""
+    """It is not, and the search gave up before: a kink, mostly. Projected gradient after a whole round that lowered
+    the value by less than a thousandth of the tolerance (relative), Gauss-Newton at its highest damping."""
 
 
 class Solution(eqx.Module):
