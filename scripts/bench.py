@@ -15,125 +15,30 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from functools import cache, partial
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import peers
+from peers import shortest
+from peers.paper_way import bar_problem, dense_objective, paper_way
+from peers.smoothers import cuthbert_smoother, dynamax_smoother, linear_model, walking_trials
+from problems import OPTIONS, Batch, bars, run_direct, strapdown_seconds, walk, with_rests
 
 from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.smoother import smooth_about
-from jaxsat.pipeline import _smooth, estimate, prepare, search_options
+from jaxsat.inertial.strapdown import Samples
+from jaxsat.pipeline import _smooth, estimate, prepare
 from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.compensate import UNFILLED, arrival_marks, filter_trial, solve_segments
-from jaxsat.saturation.layout import Trial, gather, padded_sizes
+from jaxsat.saturation.layout import gather, padded_sizes
 from jaxsat.saturation.segment import condense, value_gradient_root
-from jaxsat.signals.recording import Recording
-from jaxsat.signals.rests import find_segments
 from jaxsat.studies.boards import Row, read_board, worse, write_board
-from jaxsat.studies.motions import Bar, Walk
-from jaxsat.studies.simulate import GRAVITY, Truth, write_simulation
+from jaxsat.studies.motions import Bar
+from jaxsat.studies.simulate import GRAVITY, write_simulation
 
 GATE_TOLERANCE = 0.5
-
-
-jax.config.update("jax_enable_x64", True)
-OPTIONS = search_options(load_config(), "direct")
-
-
-# --- Problems ---------------------------------------------------------------------------------------------------
-
-
-class Batch(eqx.Module):
-    """Bar trials of the paper's simulation, each clipped so that as many samples saturate as asked."""
-
-    trials: Trial
-    departure: np.ndarray
-    arrival: np.ndarray
-    segment_at: np.ndarray
-    starts: np.ndarray
-
-
-def with_rests(recording: Recording, truth: Truth) -> Recording:
-    """The recording with its rests as they truly are."""
-    return eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None)
-
-
-@cache
-def bars(trials: int, samples: int = 512, saturated: int = 32) -> Batch:
-    """B trials with noise of their own, leading axis B."""
-    rate = samples / 1.6
-    recording, truth = simulate(Bar(), rate=rate, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
-    prepared = prepare(
-        eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None), load_config()
-    )
-    base = jax.tree.map(np.asarray, prepared.trial)
-    rng = np.random.default_rng(0)
-    signal = base.signal[None] + rng.normal(size=(trials, *base.signal.shape)) * np.sqrt(base.variance)[None]
-    rate_y = np.abs(signal[:, :, 1])
-    rail = np.sort(rate_y, axis=1)[:, -saturated]
-    at = rate_y >= rail[:, None]
-    signal[:, :, 1] = np.where(at, np.sign(signal[:, :, 1]) * rail[:, None], signal[:, :, 1])
-    sign = np.zeros(signal.shape, int)
-    sign[:, :, 1] = np.where(at, np.sign(signal[:, :, 1]), 0)
-    segments = find_segments(prepared.rest)
-    busy = [i for i in range(len(segments)) if at[0, segments.departure[i] + 1 : segments.arrival[i]].any()]
-    assert len(busy) == 1, "the bar moves once"
-    segment_at, starts = arrival_marks(len(base.signal), segments)
-    whole = jax.tree.map(lambda x: np.broadcast_to(x, (trials, *np.shape(x))), base)
-    whole = eqx.tree_at(
-        lambda t: (t.signal, t.sign, t.clean, t.bound),
-        whole,
-        (signal, sign, sign == 0, np.full((trials, 6), 5.0)),
-    )
-    return Batch(whole, segments.departure[busy], segments.arrival[busy], segment_at, starts)
-
-
-def direct(trial: Trial, batch: Batch, whole: bool):
-    """δ of one trial from its arrays: filter to the departure, what the arrival tells, and the search.
-
-    whole: with the filter over the entire trial, as a recording of many segments needs it.
-    """
-    marks = (jnp.asarray(batch.segment_at), jnp.asarray(batch.starts))
-    samples = peers.Samples(trial.signal, trial.period, trial.variance)
-    table = arrivals(samples, trial.rows, *marks, 1)
-    stop = len(trial.period) if whole else int(batch.departure[0]) + 1
-    first = jax.tree.map(lambda x: x[:stop] if np.ndim(x) and len(x) == len(trial.period) else x, trial)
-    states, covariances = filter_trial(first, first.signal, jnp.asarray(UNFILLED))
-    state = jax.tree.map(lambda x: x[batch.departure], states)
-    sizes = padded_sizes(int(batch.arrival[0] - batch.departure[0]), 32, factor=2)
-    return solve_segments(
-        trial, state, covariances[batch.departure], table, batch.departure, batch.arrival, sizes, OPTIONS
-    )
-
-
-def run_direct(batch: Batch, whole: bool) -> Callable:
-    solve = jax.jit(jax.vmap(lambda trial: direct(trial, batch, whole)))
-    trials = jax.device_put(jax.tree.map(jnp.asarray, batch.trials))
-    return lambda: solve(trials)
-
-
-@cache
-def strapdown_seconds(trials: int = 256, samples: int = 512, all_states: bool = True) -> float:
-    signal, initial = peers.bare_trials(trials, samples)
-    return peers.shortest(
-        partial(peers.numba_strapdown, signal, 0.005, initial, GRAVITY, all_states=all_states), 50
-    )
-
-
-def walk(seconds: float, seed: int = 0, rail: float = 5.0):
-    """A foot at 200 Hz with 35 segments in 32 s, each of them saturated."""
-    motion = Walk(strides=round(35 * seconds / 32), swing=0.5, stance=0.36)
-    recording, truth = simulate(
-        motion, rate=200.0, duration=seconds, sensor=Sensor(gyr_rail=rail), key=jax.random.key(seed)
-    )
-    return recording, truth
-
-
-# --- Rows -------------------------------------------------------------------------------------------------------
 
 
 def objective_vs_strapdown() -> Iterator[Row]:
@@ -141,7 +46,7 @@ def objective_vs_strapdown() -> Iterator[Row]:
     sizes = padded_sizes(int(batch.arrival[0] - batch.departure[0]), 32, factor=2)
 
     def segment(trial):
-        samples = peers.Samples(trial.signal, trial.period, trial.variance)
+        samples = Samples(trial.signal, trial.period, trial.variance)
         table = arrivals(samples, trial.rows, jnp.asarray(batch.segment_at), jnp.asarray(batch.starts), 1)
         states, covariances = filter_trial(trial, trial.signal, jnp.asarray(UNFILLED))
         at = batch.departure[0]
@@ -153,7 +58,7 @@ def objective_vs_strapdown() -> Iterator[Row]:
     delta = jnp.ones((256, sizes.values))
     evaluate = jax.jit(jax.vmap(lambda d, c, g: value_gradient_root(d, c, g)[:2], in_axes=(0, 0, None)))
     bare = strapdown_seconds()
-    seconds = peers.shortest(lambda: evaluate(delta, condensed, jnp.asarray(GRAVITY)), 50)
+    seconds = shortest(lambda: evaluate(delta, condensed, jnp.asarray(GRAVITY)), 50)
     bare = min(bare, strapdown_seconds())
     last = strapdown_seconds(all_states=False)
     yield Row(
@@ -166,8 +71,8 @@ def objective_vs_strapdown() -> Iterator[Row]:
 def direct_vs_strapdown() -> Iterator[Row]:
     bare = strapdown_seconds()
     batch = bars(256)
-    seconds = peers.shortest(run_direct(batch, False))
-    whole = peers.shortest(run_direct(batch, True))
+    seconds = shortest(run_direct(batch, False))
+    whole = shortest(run_direct(batch, True))
     found, _ = run_direct(batch, False)()
     assert (np.asarray(found.solution.status) == 0).all(), "every search converges"
     yield Row(
@@ -185,8 +90,8 @@ def estimate_vs_smoother() -> Iterator[Row]:
     found = estimate(recording, config)
     with jax.enable_x64(True):
         trial = prepare(recording, config).trial
-        smoother = peers.shortest(lambda: _smooth(trial, config)[0].cost)
-    seconds = peers.shortest(lambda: estimate(recording, config).cost)
+        smoother = shortest(lambda: _smooth(trial, config)[0].cost)
+    seconds = shortest(lambda: estimate(recording, config).cost)
     busy = int((found.fills.status != 2).sum())
     yield Row(
         "estimate_vs_smoother", seconds / smoother, "1", "lower", 3, None,
@@ -195,8 +100,8 @@ def estimate_vs_smoother() -> Iterator[Row]:
 
 
 def paper_way_speedup() -> Iterator[Row]:
-    problem = peers.bar_problem(0)
-    theirs = peers.paper_way(problem)
+    problem = bar_problem(0)
+    theirs = paper_way(problem)
     recording, truth = simulate(
         Bar(), rate=100.0, duration=1.6, sensor=Sensor(gyr_rail=7.5), key=jax.random.key(0)
     )
@@ -210,7 +115,7 @@ def paper_way_speedup() -> Iterator[Row]:
     tight = eqx.tree_at(lambda o: o.tolerance, OPTIONS, jnp.asarray(1e-5))
 
     def solve(trial):
-        samples = peers.Samples(trial.signal, trial.period, trial.variance)
+        samples = Samples(trial.signal, trial.period, trial.variance)
         table = arrivals(samples, trial.rows, jnp.asarray(segment_at), jnp.asarray(starts), 1)
         states, covariances = filter_trial(trial, trial.signal, jnp.asarray(0.0))
         state = jax.tree.map(lambda x: x[batch.departure], states)
@@ -223,8 +128,8 @@ def paper_way_speedup() -> Iterator[Row]:
     found, values = run(trial)
     real = np.asarray(values.sample[0]) < len(recording)
     delta = np.asarray(found.delta[0])[real]
-    cost = peers.dense_objective(problem)(delta)
-    seconds = peers.shortest(lambda: run(trial), 30)
+    cost = dense_objective(problem)(delta)
+    seconds = shortest(lambda: run(trial), 30)
     yield Row(
         "paper_way_speedup", theirs.seconds / seconds, "1", "higher", 1000, 1,
         f"{len(delta)} δ, N = 160: {theirs.seconds:.1f} s and J* = {theirs.cost:.6f} by SLSQP on the dense problem "
@@ -233,8 +138,8 @@ def paper_way_speedup() -> Iterator[Row]:
 
 
 def smoother_vs_peers() -> Iterator[Row]:
-    trials = peers.walking_trials(64, 1000)
-    model = peers.linear_model(trials)
+    trials = walking_trials(64, 1000)
+    model = linear_model(trials)
     gravity = jnp.asarray(GRAVITY)
 
     @jax.jit
@@ -245,12 +150,11 @@ def smoother_vs_peers() -> Iterator[Row]:
             )
         )(trials.reference, trials.samples, trials.rows, trials.prior)
 
-    seconds = peers.shortest(ours)
+    seconds = shortest(ours)
     others = {
-        "dynamax": peers.shortest(peers.dynamax_smoother(model), 3),
+        "dynamax": shortest(dynamax_smoother(model), 3),
         "cuthbert": min(
-            peers.shortest(peers.cuthbert_smoother(model, variant), 2)
-            for variant in ("moments", "sequential")
+            shortest(cuthbert_smoother(model, variant), 2) for variant in ("moments", "sequential")
         ),
     }
     best = min(others, key=others.__getitem__)
@@ -261,7 +165,7 @@ def smoother_vs_peers() -> Iterator[Row]:
 
 
 def batch_amortisation() -> Iterator[Row]:
-    one, many = (peers.shortest(run_direct(bars(size), False), 10) for size in (1, 1024))
+    one, many = (shortest(run_direct(bars(size), False), 10) for size in (1, 1024))
     yield Row(
         "batch_amortisation", many / 1024 / one, "1", "lower", 0.05, None,
         f"direct estimate of a trial: {1e3 * one:.2f} ms alone, {1e3 * many / 1024:.3f} ms among 1,024",
@@ -272,7 +176,7 @@ def growth() -> Iterator[Row]:
     def seconds(length):
         recording, truth = walk(length)
         recording = with_rests(recording, truth)
-        return peers.shortest(lambda: estimate(recording, load_config(None, method="direct")).cost, 3)
+        return shortest(lambda: estimate(recording, load_config(None, method="direct")).cost, 3)
 
     # Lengths that fill their padded shapes equally well.
     short, long = seconds(15.36), seconds(8 * 15.36)
@@ -280,7 +184,7 @@ def growth() -> Iterator[Row]:
         "growth_time", long / short, "1", "lower", 9, None,
         f"`estimate` with direct: {short:.2f} s for 3,072 samples, {long:.2f} s for 24,576",
     )  # fmt: skip
-    few, many = (peers.shortest(run_direct(bars(size), False), 10) for size in (128, 1024))
+    few, many = (shortest(run_direct(bars(size), False), 10) for size in (128, 1024))
     yield Row(
         "growth_batch", many / few, "1", "lower", 8.5, None,
         f"direct estimate: {1e3 * few:.0f} ms for 128 trials, {1e3 * many:.0f} ms for 1,024",
@@ -378,7 +282,7 @@ def gpu() -> Iterator[Row]:
         with jax.default_device(device):
             part = batch if device.platform == "gpu" else jax.tree.map(lambda x: x, bars(1024))
             share = 1.0 if device.platform == "gpu" else 10_000 / 1024
-            seconds[device.platform] = share * peers.shortest(run_direct(part, False), 3)
+            seconds[device.platform] = share * shortest(run_direct(part, False), 3)
     yield Row(
         "gpu_vs_cpu", seconds["cpu"] / seconds["gpu"], "1", "higher", 50, None,
         f"direct estimate of 10,000 segments at one rail: {seconds['gpu']:.3f} s; CPU {seconds['cpu']:.1f} s "

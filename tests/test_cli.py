@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -102,6 +103,13 @@ def test_a_sweep_writes_its_table_and_a_summary(bar, tmp_path, capsys):
     assert summary["inputs"][0]["sha256"] == hashlib.sha256(bar.read_bytes()).hexdigest()
     assert main(["estimate", str(bar), "-o", str(out)]) == 2, "an estimate does not replace a sweep"
     assert "sweep.parquet" in capsys.readouterr().err
+
+
+def test_a_sweep_of_files_of_which_none_can_be_used_is_an_error(tmp_path, capsys):
+    paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    assert main(["sweep", *map(str, paths), "-o", str(tmp_path / "out")]) == 2
+    assert re.search(r"a\.csv.* \(and 1 more", capsys.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_quiet_sweep_in_the_unit_of_the_file_writes_csv(bar, tmp_path, capfd):

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
+from problems import compose
 from scipy.spatial.transform import Rotation
 
 from jaxsat.inertial.components import Quaternion, Vector
 from jaxsat.inertial.preintegration import Stretch, attitude_prefixes, passage, stretches
-from jaxsat.inertial.strapdown import compose, error_transition, sample_intervals, sample_noise
+from jaxsat.inertial.strapdown import error_transition, sample_intervals, sample_noise
 
 N = 40
 SAMPLES = problems.samples(N, isotropic=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from jaxsat.saturation.solvers import Status, box_step, projected_gauss_newton, projected_gradient
+from jaxsat.saturation.solvers import Box, Status, box_step, projected_gauss_newton, projected_gradient
 
 RNG = np.random.default_rng(4)
 A = RNG.normal(size=(6, 8)) * np.geomspace(1.0, 30.0, 8)
@@ -32,7 +32,8 @@ def solve(solver, upper=UPPER, stretch=1.0, tolerance=1e-7, max_iterations=4000)
     stretch = jnp.asarray(np.broadcast_to(stretch, 8))
     fun = least_squares(lambda x: jnp.asarray(A) @ (x * stretch) - jnp.asarray(B))
     limits = jnp.zeros(8), jnp.zeros(8), jnp.asarray(upper) / stretch
-    return jax.jit(lambda: solver(fun, *limits, SCALE / stretch, jnp.asarray(tolerance), max_iterations))()
+    box = Box(*limits, SCALE / stretch, jnp.asarray(tolerance), max_iterations)
+    return jax.jit(lambda: solver(fun, box))()
 
 
 @both
@@ -56,10 +57,10 @@ def test_scaled_variables_make_the_result_independent_of_units(solver):
 @both
 def test_running_out_of_iterations_is_said(solver):
     rosenbrock = least_squares(lambda x: jnp.stack([14.0 * (x[1] - x[0] ** 2), 1.4 * (1.0 - x[0])]))
-    start, lower, upper = jnp.array([0.1, 0.9]), jnp.zeros(2), jnp.full(2, 2.0)
-    found = solver(rosenbrock, start, lower, upper, jnp.full(2, 0.1), jnp.asarray(1e-9), 1)
+    start, lower, upper, scale = jnp.array([0.1, 0.9]), jnp.zeros(2), jnp.full(2, 2.0), jnp.full(2, 0.1)
+    found = solver(rosenbrock, Box(start, lower, upper, scale, jnp.asarray(1e-9), 1))
     assert found.status == Status.MAX_ITERATIONS and found.residual > 1e-9
-    later = solver(rosenbrock, start, lower, upper, jnp.full(2, 0.1), jnp.asarray(1e-6), 3000)
+    later = solver(rosenbrock, Box(start, lower, upper, scale, jnp.asarray(1e-6), 3000))
     assert later.status == Status.CONVERGED
     np.testing.assert_allclose(later.x, 1.0, atol=1e-4)
 
@@ -76,8 +77,8 @@ def test_a_variable_without_range_stays_where_it_is(solver, held):
 def test_gauss_newton_takes_the_shortest_of_the_steps_that_the_data_cannot_tell_apart():
     wide = np.full(8, 1e3)
     fun = least_squares(lambda x: jnp.asarray(A[:3]) @ x - jnp.asarray(A[:3] @ np.ones(8)))
-    start = jnp.zeros(8), jnp.full(8, -1e3), jnp.asarray(wide)
-    found = projected_gauss_newton(fun, *start, jnp.ones(8), jnp.asarray(1e-8), 200)
+    limits = jnp.zeros(8), jnp.full(8, -1e3), jnp.asarray(wide)
+    found = projected_gauss_newton(fun, Box(*limits, jnp.ones(8), jnp.asarray(1e-8), 200))
     np.testing.assert_allclose(found.x, np.linalg.pinv(A[:3]) @ A[:3] @ np.ones(8), atol=1e-6)
 
 

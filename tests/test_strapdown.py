@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
+from problems import compose
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -11,7 +12,6 @@ from jaxsat.inertial.rotations import quat_log, quat_multiply, quat_to_matrix
 from jaxsat.inertial.strapdown import (
     add_error,
     advance,
-    compose,
     error_between,
     error_transition,
     prefixes,

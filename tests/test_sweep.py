@@ -1,7 +1,7 @@
 """Sweeps: an element is an estimate, rails and chunks change neither programs nor results, one bad trial one row."""
 
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from jaxsat.signals.recording import Recording
 from jaxsat.studies import elements
 from jaxsat.studies.motions import Bar
 from jaxsat.studies.simulate import Sensor, simulate
-from jaxsat.studies.sweep import sweep, sweep_files
+from jaxsat.studies.sweep import sweep
 
 RAIL = 7.5
 RAILS = (RAIL, np.inf)
@@ -180,8 +180,9 @@ def test_configurations_and_recordings_that_cannot_be_swept_are_told(trials):
             sweep(trials, Config.model_validate(section))
     with pytest.raises(InputError, match="two recordings are called 'whole'"):
         sweep([trials[0], trials[0]])
-    with pytest.raises(InputError, match="there is no recording"):
-        sweep([])
+    for nothing in ([], {}):
+        with pytest.raises(InputError, match="there is no recording"):
+            sweep(nothing)
 
 
 def test_a_rail_within_what_the_sensor_reads_at_rest_is_a_failed_row(trials):
@@ -190,7 +191,28 @@ def test_a_rail_within_what_the_sensor_reads_at_rest_is_a_failed_row(trials):
     assert "a rail of 9 m/s² lies within what the sensor reads at rest" in found["note"][0]
 
 
-def test_files_of_which_none_can_be_used_are_an_error(tmp_path):
-    paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
-    with pytest.raises(InputError, match=r"a\.csv.* \(and 1 more"):
-        sweep_files(paths)
+def test_recordings_are_loaded_in_turn_under_the_names_given(table, trials):
+    """One that cannot be loaded costs a row, as one that cannot be used; messages speak of the name given."""
+    loaded = []
+
+    def load(k):
+        loaded.append(k)
+        return trials[k]
+
+    def absent():
+        raise InputError("gone.csv: there is no such file.")
+
+    loaders = {f"file {k}": partial(load, k) for k in range(4)}
+    found = sweep({"gone": absent, **loaders}, settings(), gyr_rails=RAILS)
+    assert loaded == [0, 1, 2, 3]
+    assert tuple(found.iloc[0][["trial", "status", "note"]]) == (
+        "gone",
+        "failed",
+        "gone.csv: there is no such file.",
+    )
+    names = dict(zip((trial.name for trial in trials), loaders, strict=True))
+    failed = found.set_index("trial").loc["file 1", "note"]
+    assert failed == table.set_index("trial").loc["moving", "note"].replace("moving", "file 1")
+    assert failed.startswith("file 1")
+    expected = table.assign(trial=table["trial"].replace(names)).drop(columns="note")
+    pd.testing.assert_frame_equal(found.iloc[1:].drop(columns="note").reset_index(drop=True), expected)

@@ -22,6 +22,7 @@ from jaxsat.cli.shared import (
     scales,
     use_compilation_cache,
 )
+from jaxsat.errors import InputError
 
 _CLIP = "limit to clip at: none or a magnitude as for estimate; repeatable"
 Rails = Annotated[list[str] | None, typer.Option(help=_CLIP, metavar="VALUE")]
@@ -78,18 +79,30 @@ def sweep_command(
         "acc_bounds": acc_bound or [settings.saturation.acc_bound],
     }
     use_compilation_cache()
-    from jaxsat.studies.sweep import sweep_files
+    from jaxsat.studies.sweep import sweep
 
-    def read(path: Path):
-        return read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc)
+    def loader(path: Path):
+        return lambda: read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc)
 
+    loaders = {str(path): loader(path) for path in recordings}
+    if len(loaders) < len(recordings):
+        twice = next(str(path) for i, path in enumerate(recordings) if path in recordings[:i])
+        raise InputError(f"{twice} is given twice; give each recording once.")
     started = time.perf_counter()
     with progress_bar(quiet) as progress:
-        table = sweep_files(recordings, settings, read=read, memory=memory * 1e9, progress=progress, **swept)
+        table = sweep(loaders, settings, memory=memory * 1e9, progress=progress, **swept)
+    _check_used(table)
     summary = summarise_sweep(table, settings, swept, recordings, time.perf_counter() - started)
     path = write_sweep(table, summary, out, csv=csv)
     if not quiet:
         typer.echo(sweep_text(table, path))
+
+
+def _check_used(table) -> None:
+    """A table without any result is an error: nothing is written."""
+    if set(table["status"]) == {"failed"}:
+        more = f" (and {len(table) - 1} more recordings that cannot be used)" if len(table) > 1 else ""
+        raise InputError(f"{table['note'].iloc[0]}{more}")
 
 
 def _swept_rails(

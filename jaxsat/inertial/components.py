@@ -3,7 +3,8 @@
 Kept in one array, the components of many vectors lie side by side, and compiled code must slice, select and copy
 between any two operations. One array per component makes every operation plain arithmetic on equal shapes, and
 a chain of them one loop: the segment objective and its gradient are seven times faster on a CPU so. A component
-may have any shape; components broadcast. Zero as a Python number is structural and costs nothing.
+may have any shape; components broadcast. In sums, scaling, dot, outer and matrix products zero as a Python number is
+structural: it costs nothing and stays. Cross products, quaternions and `Cholesky` compute with it as with any number.
 """
 
 import equinox as eqx

@@ -191,7 +191,11 @@ def stretches(
 
 @jax.custom_jvp
 def attitude_prefixes(rotations: Quaternion) -> Quaternion:
-    """q₀⊗…⊗q_j for each j of the leading axis."""
+    """q₀⊗…⊗q_j for each j of the leading axis.
+
+    The derivative is that of rotations and holds for unit quaternions only: what a tangent would change of their
+    length is left out.
+    """
 
     def step(total, rotation):
         total = total @ rotation

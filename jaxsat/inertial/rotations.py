@@ -45,7 +45,7 @@ def quat_conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
 
 def quat_rotate(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """Rotate a vector: q ⊗ v ⊗ q*."""
-    # As arrays: inside a scan over samples this is the faster form, by 40 % of the closed loop.
+    # As arrays: inside a scan over samples the form of `components` makes the closed loop about 70 % slower.
     t = 2.0 * jnp.cross(q[1:], v)
     return v + q[0] * t + jnp.cross(q[1:], t)
 

@@ -1,8 +1,8 @@
 """Strapdown integration on one composable type: the interval.
 
 An interval is what the sensors say about a stretch of time, whatever the state at its start. A sample is an
-interval, several samples are one too: `compose` joins neighbours and is associative, so prefixes can be taken
-in any order. Navigation needs an interval only through `advance`.
+interval, several samples are one too: neighbours join into one, so `prefixes` needs a running product and running
+sums only. Navigation needs an interval only through `advance`.
 """
 
 import equinox as eqx
@@ -34,7 +34,7 @@ class Interval(eqx.Module):
     position: Float[Array, "*batch 3"]
     """W = ∬ specific force dt² in b₀ (m)."""
     duration: Float[Array, "*batch"]
-    """τ (s); zero makes the interval the identity of `compose`."""
+    """τ (s); a sample of zero makes an interval that changes nothing."""
 
 
 class Samples(eqx.Module):
@@ -108,18 +108,6 @@ def sample_noise(
             [zero, half**2 * pushed, half * pushed],
             [zero, half * pushed, pushed],
         ]
-    )
-
-
-def compose(first: Interval, second: Interval) -> Interval:
-    """Two neighbouring intervals as one; associative."""
-    velocity = quat_rotate(first.rotation, second.velocity)
-    position = quat_rotate(first.rotation, second.position)
-    return Interval(
-        rotation=quat_multiply(first.rotation, second.rotation),
-        velocity=first.velocity + velocity,
-        position=first.position + first.velocity * second.duration + position,
-        duration=first.duration + second.duration,
     )
 
 

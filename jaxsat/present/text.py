@@ -107,15 +107,15 @@ def sweep_text(table: pd.DataFrame, path: Path) -> str:
     used, failed = table.query("status != 'failed'"), table.query("status == 'failed'")
     words = sorted(set(used["status"]))
     rows = [["method", "gyr rail", "acc rail", "path RMSE", *words]]
-    counted = used.groupby(["method", "gyr_rail", "acc_rail"], sort=False)
-    for labels, rmse in counted["path_rmse"].median().items():
-        method, *rails = labels  # type: ignore[misc]
-        ends = list(counted.get_group(labels)["status"])
+    labels = ["method", "gyr_rail", "acc_rail"]
+    for _, group in used.groupby(labels, sort=False):
+        method, *rails = group[labels].iloc[0]
+        ends = list(group["status"])
         rows.append(
             [
                 method,
                 *(f"{rail:.4g}" if np.isfinite(rail) else "none" for rail in rails),
-                f"{rmse:.4g} m",
+                f"{group['path_rmse'].median():.4g} m",
                 *(str(ends.count(word)) for word in words),
             ]
         )

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.saturation.gap_shapes import peak, shape_value
 from jaxsat.saturation.segment import Segment, condense, value_and_root, value_gradient_root
-from jaxsat.saturation.solvers import Solution, Status, projected_gauss_newton, projected_gradient
+from jaxsat.saturation.solvers import Box, Solution, Status, projected_gauss_newton, projected_gradient
 
 Compensation = Literal["direct", "triangle", "quadratic"]
 Solver = Literal["gauss_newton", "projected_gradient"]
@@ -107,15 +107,15 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     scale = jnp.where(
         has_range, 1.0 / jnp.sqrt(curvature + 1.0 / jnp.where(has_range, search.upper, 1.0) ** 2), 1.0
     )
-    solution = _SOLVERS[options.solver](
-        linearise,
-        search.start,
-        jnp.zeros_like(search.upper),
-        search.upper,
-        scale,
-        options.tolerance,
-        options.max_iterations,
+    box = Box(
+        start=search.start,
+        lower=jnp.zeros_like(search.upper),
+        upper=search.upper,
+        scale=scale,
+        tolerance=options.tolerance,
+        max_iterations=options.max_iterations,
     )
+    solution = _SOLVERS[options.solver](linearise, box)
     blind = ~jnp.any(segment.arrival != 0.0)
     keep = blind | (solution.value > before)
     delta = jnp.where(keep, 0.0, search.delta(solution.x))

@@ -31,7 +31,8 @@ class Status(enum.IntEnum):
     NO_ARRIVAL = 3
     """No rest follows, so the data say nothing; the start is returned."""
     STALLED = 4
-    """A whole round lowered the value by less than a thousandth of the tolerance (relative): a kink, mostly."""
+    """It is not, and the search gave up before: a kink, mostly. Projected gradient after a whole round that lowered
+    the value by less than a thousandth of the tolerance (relative), Gauss-Newton at its highest damping."""
 
 
 class Solution(eqx.Module):
@@ -51,6 +52,24 @@ Linearise = Callable[
 """Value, gradient, and the columns of A with A Aᵀ the Gauss-Newton Hessian."""
 
 
+class Box(eqx.Module):
+    """Where to search, from where, and how far: lower ≤ x ≤ upper."""
+
+    start: Float[Array, "n"]
+    lower: Float[Array, "n"]
+    upper: Float[Array, "n"]
+    scale: Float[Array, "n"]
+    """The change of each x that moves the value by about ½ (1/√ of the Hessian's diagonal)."""
+    tolerance: float | Float[Array, ""]
+    """Of the solution's residual."""
+    max_iterations: int | Int[Array, ""]
+
+    def scaled(self) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+        """Start, moved into the box, and the bounds, in u = x / scale."""
+        low, high = self.lower / self.scale, self.upper / self.scale
+        return jnp.clip(self.start / self.scale, low, high), low, high
+
+
 def _assess(linearise: Linearise, u, scale, low, high):
     """Value, gradient and columns in u = x / scale, and the residual of a bounded stationary point."""
     value, gradient, columns = linearise(u * scale)
@@ -63,66 +82,56 @@ def _assess(linearise: Linearise, u, scale, low, high):
 _STEPS_PER_ROUND = 120
 
 
-def projected_gradient(
-    linearise: Linearise,
-    start: Float[Array, "n"],
-    lower: Float[Array, "n"],
-    upper: Float[Array, "n"],
-    scale: Float[Array, "n"],
-    tolerance: float | Float[Array, ""],
-    max_iterations: int | Int[Array, ""],
-) -> Solution:
-    """Minimise over lower ≤ x ≤ upper by accelerated projected gradient with restarts.
+def projected_gradient(linearise: Linearise, box: Box) -> Solution:
+    """Minimise over the box by accelerated projected gradient with restarts.
 
-    scale: the change of each x that moves the value by about ½ (1/√ of the Hessian's diagonal). The search runs in
-    u = x / scale on the value divided by the number of free variables, so curvature is at most about 1 in any
-    direction: `jaxopt.ProjectedGradient` restarts its step at 1 and can stop far from the optimum otherwise.
-    Whether it has arrived is decided by the residual of the solution, not by the solver's own step length.
+    The search runs in u = x / scale on the value divided by the number of free variables, so curvature is at most
+    about 1 in any direction: `jaxopt.ProjectedGradient` restarts its step at 1 and can stop far from the optimum
+    otherwise. Whether it has arrived is decided by the residual of the solution, not by the solver's own step length.
     """
-    low, high = lower / scale, upper / scale
-    share = 1.0 / jnp.maximum(jnp.sum(upper > lower), 1).astype(start.dtype)
+    u, low, high = box.scaled()
+    share = 1.0 / jnp.maximum(jnp.sum(box.upper > box.lower), 1).astype(u.dtype)
 
     def shared(u):
-        value, gradient, _ = linearise(u * scale)
-        return share * value, share * scale * gradient
+        value, gradient, _ = linearise(u * box.scale)
+        return share * value, share * box.scale * gradient
 
     solver = jaxopt.ProjectedGradient(
         fun=shared,
         value_and_grad=True,
-        projection=lambda u, box: optax.projections.projection_box(u, *box),
+        projection=lambda u, limits: optax.projections.projection_box(u, *limits),
         maxls=15,
     )
 
     def proceed(carry):
         _, _, error, count, stalled = carry
-        return (error > tolerance) & (count < max_iterations) & ~stalled
+        return (error > box.tolerance) & (count < box.max_iterations) & ~stalled
 
     def one_step(carry):
         return tuple(solver.update(*carry, hyperparams_proj=(low, high)))
 
     def still_moving(carry):
         state = carry[1]
-        return (state.iter_num < _STEPS_PER_ROUND) & (state.error > 0.01 * share * tolerance)
+        return (state.iter_num < _STEPS_PER_ROUND) & (state.error > 0.01 * share * box.tolerance)
 
     def one_round(carry):
         u, value, error, count, _ = carry
         u_end, state = jax.lax.while_loop(still_moving, one_step, (u, solver.init_state(u, (low, high))))
         u_end = optax.projections.projection_box(u_end, low, high)
-        end_value, _, _, end_error = _assess(linearise, u_end, scale, low, high)
+        end_value, _, _, end_error = _assess(linearise, u_end, box.scale, low, high)
         better = end_value < value
         # In the first round there is nothing to compare with: value is infinite.
-        stalled = jnp.isfinite(value) & (value - end_value < 1e-3 * tolerance * (1.0 + jnp.abs(value)))
+        stalled = jnp.isfinite(value) & (value - end_value < 1e-3 * box.tolerance * (1.0 + jnp.abs(value)))
         u, value, error = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (u_end, end_value, end_error), (u, value, error)
         )
         return u, value, error, count + state.iter_num, stalled
 
-    u = optax.projections.projection_box(start / scale, low, high)
-    infinite = jnp.full((), jnp.inf, start.dtype)
+    infinite = jnp.full((), jnp.inf, u.dtype)
     u, value, error, count, stalled = jax.lax.while_loop(
         proceed, one_round, (u, infinite, infinite, jnp.asarray(0), jnp.asarray(False))
     )
-    return _solution(u * scale, value, error, count, stalled, tolerance)
+    return _solution(u * box.scale, value, error, count, stalled, box.tolerance)
 
 
 def _solution(x, value, error, count, stalled, tolerance) -> Solution:
@@ -137,33 +146,25 @@ def _solution(x, value, error, count, stalled, tolerance) -> Solution:
 _DAMPING = (1.0, 1e-2, 1e6)
 
 
-def projected_gauss_newton(
-    linearise: Linearise,
-    start: Float[Array, "n"],
-    lower: Float[Array, "n"],
-    upper: Float[Array, "n"],
-    scale: Float[Array, "n"],
-    tolerance: float | Float[Array, ""],
-    max_iterations: int | Int[Array, ""],
-) -> Solution:
+def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
     """The same problem by Gauss-Newton steps within the box, damped after Levenberg and Marquardt.
 
     The Hessian has a low rank, so most directions are free: damping takes the shortest of the steps (in scaled
     variables) that the data cannot tell apart. One evaluation a step; a step that does not pay is not taken.
     """
-    low, high = lower / scale, upper / scale
+    u, low, high = box.scaled()
     first, least, most = _DAMPING
-    rank = len(jax.eval_shape(linearise, start)[2])
+    rank = len(jax.eval_shape(linearise, box.start)[2])
 
     def proceed(carry):
         _, _, (_, _, _, error), _, damping, count = carry
-        return (error > tolerance) & (count <= max_iterations) & (damping < most)
+        return (error > box.tolerance) & (count <= box.max_iterations) & (damping < most)
 
     def step(carry):
         # The start is evaluated in the first round, so the objective is compiled once.
         u, there, at, promised, damping, count = carry
         value, _, _, error = at
-        new = _assess(linearise, there, scale, low, high)
+        new = _assess(linearise, there, box.scale, low, high)
         kept = jnp.where(promised > 0.0, (value - new[0]) / jnp.where(promised > 0.0, promised, 1.0), 0.0)
         # Where the value no longer tells two points apart, the residual does.
         level = (new[0] - value <= 1e-13 * jnp.abs(value)) & (new[3] < error)
@@ -177,14 +178,13 @@ def projected_gauss_newton(
         promised = -jnp.sum(gradient * d) - 0.5 * sum(jnp.sum(a * d) ** 2 for a in columns)
         return u, there, at, promised, damping, count + 1
 
-    u = jnp.clip(start / scale, low, high)
-    infinite, zero = jnp.full((), jnp.inf, start.dtype), jnp.zeros((), start.dtype)
+    infinite, zero = jnp.full((), jnp.inf, u.dtype), jnp.zeros((), u.dtype)
     nothing = (infinite, jnp.zeros_like(u), tuple(jnp.zeros_like(u) for _ in range(rank)), infinite)
-    damping = jnp.full((), first, start.dtype)
+    damping = jnp.full((), first, u.dtype)
     u, _, (value, _, _, error), _, damping, count = jax.lax.while_loop(
         proceed, step, (u, u, nothing, zero, damping, jnp.asarray(0))
     )
-    return _solution(u * scale, value, error, count - 1, damping >= most, tolerance)
+    return _solution(u * box.scale, value, error, count - 1, damping >= most, box.tolerance)
 
 
 # Where the slope of a search along a line is looked at: near zero first, since small damping makes kinks there.

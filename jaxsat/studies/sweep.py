@@ -6,29 +6,30 @@ keep to a memory budget. A trial that cannot be used costs one row of the table.
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from jaxsat.config import Config
+from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
 from jaxsat.pipeline import Prepared, prepare, search_options
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
 from jaxsat.saturation.solvers import Status
-from jaxsat.signals.readers import read
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.elements import Case, element_bytes, make_case, measured, offset_of, run_elements
 
 Progress = Callable[[str, int, int], None]
 """Called with ("sweep", elements done, elements in all)."""
 
-METHODS = ("standard", "direct", "triangle", "quadratic")
+Loader = Callable[[], Recording]
+"""Raises `InputError` where there is no recording to load."""
+
+METHODS: tuple[str, ...] = get_args(Method)
 SWEPT = ("gyr_rail", "acc_rail", "gyr_bound", "acc_bound")
 _COUNTS = ("saturated", "segments", "iterations", "at_bound")
 _COLUMNS = (
@@ -39,7 +40,7 @@ _COLUMNS = (
 
 
 def sweep(
-    recordings: Sequence[Recording],
+    recordings: Sequence[Recording] | Mapping[str, Loader],
     config: Config | None = None,
     *,
     methods: Sequence[str] = ("standard", "direct"),
@@ -52,6 +53,7 @@ def sweep(
 ) -> pd.DataFrame:
     """Clip every recording at every rail, reconstruct it by every method, and tabulate how it went.
 
+    recordings: each with a name of its own; or names and a function for each that loads it when its turn comes.
     Rests are those of the recording as given, and so is the path that is compared with. gyr_rails, acc_rails:
     limits in rad/s and m/s²; infinite leaves a sensor as it is. gyr_bounds, acc_bounds: values of δ_b (default:
     those of the configuration). memory: what the arrays of a call may take (bytes); one element always runs.
@@ -60,35 +62,48 @@ def sweep(
     `saturated` (values), `segments` (that saturate), `status` (that of the worst segment), `cost_before`,
     `cost_after`, `iterations`, `residual`, `at_bound`, `path_rmse` and `end_distance` (m, against the path of the
     recording as given by `standard`), `end_x`…`end_z` (m), `fill_rmse_gyr`, `fill_rmse_acc` (rad/s and m/s², of
-    values clipped in software) and `note`. A recording that cannot be used has one row, with the status `failed`
-    and the reason in `note`. Raises `InputError` for rails, bounds, methods and configurations that cannot be.
+    values clipped in software) and `note`. A recording that cannot be loaded or used has one row, with the status
+    `failed` and the reason in `note`. Raises `InputError` for rails, bounds, methods and configurations that cannot
+    be, and for recordings that are none or share a name.
     """
-    plan = _plan(config, methods, gyr_rails, acc_rails, gyr_bounds, acc_bounds, memory)
-    return _sweep([(recording.name, lambda r=recording: r) for recording in recordings], plan, progress)
+    plan = _plan(config or Config(), methods, gyr_rails, acc_rails, gyr_bounds, acc_bounds, memory)
+    loaders = _loaders(recordings)
+    with jax.enable_x64(True):
+        # Called in here: the tolerances among them are arrays of double precision.
+        options = tuple(
+            search_options(plan.config, method) for method in plan.methods if method != "standard"
+        )
+        batches, rows = _batches(loaders, plan)
+        total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
+        for batch in batches:
+            for indices, values, real in _chunks(batch, plan):
+                cases = [batch.cases[i] for i in indices]
+                scores = run_elements(
+                    cases, values, batch.sizes, options, plan.config, "standard" in plan.methods
+                )
+                rows += _rows(scores, [batch.names[i] for i in indices[:real]], values, plan.methods)
+                done += real
+                if progress:
+                    progress("sweep", done, total)
+    place = {name: i for i, name in enumerate(loaders)}
+    rows.sort(key=lambda row: place[row["trial"]])
+    types = {name: "Int64" if name in _COUNTS else "float64" for name in _COLUMNS}
+    types |= dict.fromkeys(("trial", "method", "status", "note"), "string")
+    return pd.DataFrame(rows, columns=pd.Index(_COLUMNS)).astype(types)
 
 
-def sweep_files(
-    paths: Sequence[Path],
-    config: Config | None = None,
-    *,
-    read: Callable[[Path], Recording] = read,
-    progress: Progress | None = None,
-    **settings: Any,
-) -> pd.DataFrame:
-    """`sweep` over files, each called by its path as given; one that cannot be read costs one row too.
-
-    read: of one file. settings: those of `sweep`.
-
-    Raises `InputError` also where no file can be used at all.
-    """
-    plan = _plan(config, **settings)
-    named = [(str(path), lambda p=path: replace(read(p), name=str(p))) for path in paths]
-    table = _sweep(named, plan, progress)
-    if set(table["status"]) == {"failed"}:
-        first = table["note"].iloc[0]
-        more = f" (and {len(table) - 1} more recordings that cannot be used)" if len(table) > 1 else ""
-        raise InputError(f"{first}{more}")
-    return table
+def _loaders(recordings: Sequence[Recording] | Mapping[str, Loader]) -> dict[str, Loader]:
+    """Each recording by its name, in order."""
+    if not len(recordings):
+        raise InputError("there is no recording to sweep; give at least one.")
+    if isinstance(recordings, Mapping):
+        return dict(recordings)
+    loaders: dict[str, Loader] = {}
+    for recording in recordings:
+        if recording.name in loaders:
+            raise InputError(f"two recordings are called '{recording.name}'; give each another name.")
+        loaders[recording.name] = lambda r=recording: r
+    return loaders
 
 
 class _Plan(NamedTuple):
@@ -102,15 +117,14 @@ class _Plan(NamedTuple):
 
 
 def _plan(
-    config: Config | None,
-    methods: Sequence[str] = ("standard", "direct"),
-    gyr_rails: Sequence[float] = (np.inf,),
-    acc_rails: Sequence[float] = (np.inf,),
-    gyr_bounds: Sequence[float] | None = None,
-    acc_bounds: Sequence[float] | None = None,
-    memory: float = 2e9,
+    config: Config,
+    methods: Sequence[str],
+    gyr_rails: Sequence[float],
+    acc_rails: Sequence[float],
+    gyr_bounds: Sequence[float] | None,
+    acc_bounds: Sequence[float] | None,
+    memory: float,
 ) -> _Plan:
-    config = config or Config()
     for method in methods:
         if method not in METHODS:
             raise InputError(f"method '{method}' cannot be swept; choose among {', '.join(METHODS)}.")
@@ -142,38 +156,6 @@ def _positive(values: Sequence[float], what: str, most: float = np.finfo(float).
     return list(dict.fromkeys(float(value) for value in values))
 
 
-def _sweep(
-    named: list[tuple[str, Callable[[], Recording]]], plan: _Plan, progress: Progress | None
-) -> pd.DataFrame:
-    place = {name: i for i, (name, _) in enumerate(named)}
-    if not named:
-        raise InputError("there is no recording to sweep; give at least one.")
-    if len(place) < len(named):
-        twice = next(name for i, (name, _) in enumerate(named) if place[name] != i)
-        raise InputError(f"two recordings are called '{twice}'; give each another name.")
-    with jax.enable_x64(True):
-        # Called in here: the tolerances among them are arrays of double precision.
-        options = tuple(
-            search_options(plan.config, method) for method in plan.methods if method != "standard"
-        )
-        batches, rows = _batches(named, plan)
-        total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
-        for batch in batches:
-            for indices, values, real in _chunks(batch, plan):
-                cases = [batch.cases[i] for i in indices]
-                scores = run_elements(
-                    cases, values, batch.sizes, options, plan.config, "standard" in plan.methods
-                )
-                rows += _rows(scores, [batch.names[i] for i in indices[:real]], values, plan.methods)
-                done += real
-                if progress:
-                    progress("sweep", done, total)
-    rows.sort(key=lambda row: place[row["trial"]])
-    types = {name: "Int64" if name in _COUNTS else "float64" for name in _COLUMNS}
-    types |= dict.fromkeys(("trial", "method", "status", "note"), "string")
-    return pd.DataFrame(rows, columns=pd.Index(_COLUMNS)).astype(types)
-
-
 class _Batch(NamedTuple):
     """Trials that share a compiled program."""
 
@@ -183,14 +165,14 @@ class _Batch(NamedTuple):
     """Of their segments at the lowest rails."""
 
 
-def _batches(named, plan: _Plan) -> tuple[list[_Batch], list[dict[str, Any]]]:
+def _batches(loaders: Mapping[str, Loader], plan: _Plan) -> tuple[list[_Batch], list[dict[str, Any]]]:
     """Trials of equal padded length together; and a row for each that cannot be used."""
     lowest = np.repeat(plan.grid[:, :2].min(axis=0), 3)
     groups: dict[int, list[tuple[str, Prepared, np.ndarray]]] = {}
     failed = []
-    for name, load in named:
+    for name, load in loaders.items():
         try:
-            prepared = prepare(load(), plan.config)
+            prepared = prepare(replace(load(), name=name), plan.config)
             item = name, prepared, _clipped_most(prepared, lowest, name)
             groups.setdefault(len(prepared.trial.signal), []).append(item)
         except InputError as error:

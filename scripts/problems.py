@@ -1,0 +1,108 @@
+"""What the speed board measures on: bars in a batch, walks, and a bare strapdown pass beside them."""
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from peers import shortest
+from peers.strapdown import bare_trials, numba_strapdown
+
+from jaxsat import Sensor, load_config, simulate
+from jaxsat.inertial.strapdown import Samples
+from jaxsat.pipeline import prepare, search_options
+from jaxsat.saturation.arrival import arrivals
+from jaxsat.saturation.compensate import UNFILLED, arrival_marks, filter_trial, solve_segments
+from jaxsat.saturation.layout import Trial, padded_sizes
+from jaxsat.signals.recording import Recording
+from jaxsat.signals.rests import find_segments
+from jaxsat.studies.motions import Bar, Walk
+from jaxsat.studies.simulate import GRAVITY, Truth
+
+# Before any array is made: the tolerances among the options are of double precision.
+jax.config.update("jax_enable_x64", True)
+OPTIONS = search_options(load_config(), "direct")
+
+
+class Batch(eqx.Module):
+    """Bar trials of the paper's simulation, each clipped so that as many samples saturate as asked."""
+
+    trials: Trial
+    departure: np.ndarray
+    arrival: np.ndarray
+    segment_at: np.ndarray
+    starts: np.ndarray
+
+
+def with_rests(recording: Recording, truth: Truth) -> Recording:
+    """The recording with its rests as they truly are."""
+    return eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None)
+
+
+@cache
+def bars(trials: int, samples: int = 512, saturated: int = 32) -> Batch:
+    """B trials with noise of their own, leading axis B."""
+    rate = samples / 1.6
+    recording, truth = simulate(Bar(), rate=rate, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
+    prepared = prepare(with_rests(recording, truth), load_config())
+    base = jax.tree.map(np.asarray, prepared.trial)
+    rng = np.random.default_rng(0)
+    signal = base.signal[None] + rng.normal(size=(trials, *base.signal.shape)) * np.sqrt(base.variance)[None]
+    rate_y = np.abs(signal[:, :, 1])
+    rail = np.sort(rate_y, axis=1)[:, -saturated]
+    at = rate_y >= rail[:, None]
+    signal[:, :, 1] = np.where(at, np.sign(signal[:, :, 1]) * rail[:, None], signal[:, :, 1])
+    sign = np.zeros(signal.shape, int)
+    sign[:, :, 1] = np.where(at, np.sign(signal[:, :, 1]), 0)
+    segments = find_segments(prepared.rest)
+    busy = [i for i in range(len(segments)) if at[0, segments.departure[i] + 1 : segments.arrival[i]].any()]
+    assert len(busy) == 1, "the bar moves once"
+    segment_at, starts = arrival_marks(len(base.signal), segments)
+    whole = jax.tree.map(lambda x: np.broadcast_to(x, (trials, *np.shape(x))), base)
+    whole = eqx.tree_at(
+        lambda t: (t.signal, t.sign, t.clean, t.bound),
+        whole,
+        (signal, sign, sign == 0, np.full((trials, 6), 5.0)),
+    )
+    return Batch(whole, segments.departure[busy], segments.arrival[busy], segment_at, starts)
+
+
+def direct(trial: Trial, batch: Batch, whole: bool):
+    """δ of one trial from its arrays: filter to the departure, what the arrival tells, and the search.
+
+    whole: with the filter over the entire trial, as a recording of many segments needs it.
+    """
+    marks = (jnp.asarray(batch.segment_at), jnp.asarray(batch.starts))
+    samples = Samples(trial.signal, trial.period, trial.variance)
+    table = arrivals(samples, trial.rows, *marks, 1)
+    stop = len(trial.period) if whole else int(batch.departure[0]) + 1
+    first = jax.tree.map(lambda x: x[:stop] if np.ndim(x) and len(x) == len(trial.period) else x, trial)
+    states, covariances = filter_trial(first, first.signal, jnp.asarray(UNFILLED))
+    state = jax.tree.map(lambda x: x[batch.departure], states)
+    sizes = padded_sizes(int(batch.arrival[0] - batch.departure[0]), 32, factor=2)
+    return solve_segments(
+        trial, state, covariances[batch.departure], table, batch.departure, batch.arrival, sizes, OPTIONS
+    )
+
+
+def run_direct(batch: Batch, whole: bool) -> Callable:
+    solve = jax.jit(jax.vmap(lambda trial: direct(trial, batch, whole)))
+    trials = jax.device_put(jax.tree.map(jnp.asarray, batch.trials))
+    return lambda: solve(trials)
+
+
+@cache
+def strapdown_seconds(trials: int = 256, samples: int = 512, all_states: bool = True) -> float:
+    signal, initial = bare_trials(trials, samples)
+    return shortest(partial(numba_strapdown, signal, 0.005, initial, GRAVITY, all_states=all_states), 50)
+
+
+def walk(seconds: float, seed: int = 0, rail: float = 5.0):
+    """A foot at 200 Hz with 35 segments in 32 s, each of them saturated."""
+    motion = Walk(strides=round(35 * seconds / 32), swing=0.5, stance=0.36)
+    recording, truth = simulate(
+        motion, rate=200.0, duration=seconds, sensor=Sensor(gyr_rail=rail), key=jax.random.key(seed)
+    )
+    return recording, truth
