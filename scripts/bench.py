@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -28,11 +29,9 @@ from problems import OPTIONS, Batch, bars, run_direct, strapdown_seconds, walk, 
 
 from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.smoother import smooth_about
-from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import _smooth, estimate, prepare
-from jaxsat.saturation.arrival import arrivals
-from jaxsat.saturation.compensate import UNFILLED, arrival_marks, filter_trial, solve_segments
-from jaxsat.saturation.layout import gather, padded_sizes
+from jaxsat.saturation.compensate import UNFILLED, filter_trial
+from jaxsat.saturation.layout import gather
 from jaxsat.saturation.segment import condense, value_gradient_root
 from jaxsat.studies.boards import Row, read_board, worse, write_board
 from jaxsat.studies.motions import Bar
@@ -43,19 +42,18 @@ GATE_TOLERANCE = 0.5
 
 def objective_vs_strapdown() -> Iterator[Row]:
     batch = bars(256)
-    sizes = padded_sizes(int(batch.arrival[0] - batch.departure[0]), 32, factor=2)
 
     def segment(trial):
-        samples = Samples(trial.signal, trial.period, trial.variance)
-        table = arrivals(samples, trial.rows, jnp.asarray(batch.segment_at), jnp.asarray(batch.starts), 1)
         states, covariances = filter_trial(trial, trial.signal, jnp.asarray(UNFILLED))
         at = batch.departure[0]
         state = jax.tree.map(lambda x: x[at], states)
-        found, _ = gather(trial, at, batch.arrival[0], state, covariances[at], table[0], sizes)
+        found, _ = gather(
+            trial, at, batch.arrival[0], state, covariances[at], batch.table(trial)[0], batch.sizes
+        )
         return condense(found)
 
     condensed = jax.jit(jax.vmap(segment))(jax.tree.map(jnp.asarray, batch.trials))
-    delta = jnp.ones((256, sizes.values))
+    delta = jnp.ones((256, batch.sizes.values))
     evaluate = jax.jit(jax.vmap(lambda d, c, g: value_gradient_root(d, c, g)[:2], in_axes=(0, 0, None)))
     bare = strapdown_seconds()
     seconds = shortest(lambda: evaluate(delta, condensed, jnp.asarray(GRAVITY)), 50)
@@ -110,20 +108,10 @@ def paper_way_speedup() -> Iterator[Row]:
         None, **{"saturation.gyr_bound": 5.0, "rails.gyr": 7.5, "smoother.gyr_offset": "none"}
     )
     prepared = prepare(recording, config)
-    segment_at, starts = arrival_marks(len(prepared.trial.signal), prepared.segments)
-    batch = Batch(prepared.trial, prepared.segments.departure, prepared.segments.arrival, segment_at, starts)
+    segments = prepared.segments
+    batch = Batch(prepared.trial, segments.departure, segments.arrival, segments.rest_end)
     tight = eqx.tree_at(lambda o: o.tolerance, OPTIONS, jnp.asarray(1e-5))
-
-    def solve(trial):
-        samples = Samples(trial.signal, trial.period, trial.variance)
-        table = arrivals(samples, trial.rows, jnp.asarray(segment_at), jnp.asarray(starts), 1)
-        states, covariances = filter_trial(trial, trial.signal, jnp.asarray(0.0))
-        state = jax.tree.map(lambda x: x[batch.departure], states)
-        sizes = padded_sizes(160, 22, factor=2)
-        return solve_segments(
-            trial, state, covariances[batch.departure], table, batch.departure, batch.arrival, sizes, tight
-        )
-
+    solve = partial(direct, batch=batch, whole=False, options=tight, share=0.0)
     run, trial = jax.jit(solve), jax.tree.map(jnp.asarray, prepared.trial)
     found, values = run(trial)
     real = np.asarray(values.sample[0]) < len(recording)

@@ -14,8 +14,9 @@ from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import prepare, search_options
 from jaxsat.saturation.arrival import arrivals
-from jaxsat.saturation.compensate import UNFILLED, arrival_marks, filter_trial, solve_segments
-from jaxsat.saturation.layout import Trial, padded_sizes
+from jaxsat.saturation.compensate import UNFILLED, filter_trial, solve_segments
+from jaxsat.saturation.layout import Sizes, Trial, padded_sizes
+from jaxsat.saturation.methods import Options
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import find_segments
 from jaxsat.studies.motions import Bar, Walk
@@ -32,8 +33,18 @@ class Batch(eqx.Module):
     trials: Trial
     departure: np.ndarray
     arrival: np.ndarray
-    segment_at: np.ndarray
-    starts: np.ndarray
+    rest_end: np.ndarray
+
+    @property
+    def sizes(self) -> Sizes:
+        """Padded lengths of the one segment."""
+        return padded_sizes(int(self.arrival[0] - self.departure[0]), 32, factor=2)
+
+    def table(self, trial: Trial):
+        """Λ of the arrival in one trial."""
+        samples = Samples(trial.signal, trial.period, trial.variance)
+        longest = int((self.rest_end - self.arrival).max())
+        return arrivals(samples, trial.rows, jnp.asarray(self.arrival), jnp.asarray(self.rest_end), longest)
 
 
 def with_rests(recording: Recording, truth: Truth) -> Recording:
@@ -59,31 +70,28 @@ def bars(trials: int, samples: int = 512, saturated: int = 32) -> Batch:
     segments = find_segments(prepared.rest)
     busy = [i for i in range(len(segments)) if at[0, segments.departure[i] + 1 : segments.arrival[i]].any()]
     assert len(busy) == 1, "the bar moves once"
-    segment_at, starts = arrival_marks(len(base.signal), segments)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (trials, *np.shape(x))), base)
     whole = eqx.tree_at(
         lambda t: (t.signal, t.sign, t.clean, t.bound),
         whole,
         (signal, sign, sign == 0, np.full((trials, 6), 5.0)),
     )
-    return Batch(whole, segments.departure[busy], segments.arrival[busy], segment_at, starts)
+    return Batch(whole, segments.departure[busy], segments.arrival[busy], segments.rest_end[busy])
 
 
-def direct(trial: Trial, batch: Batch, whole: bool):
+def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, share: float = UNFILLED):
     """δ of one trial from its arrays: filter to the departure, what the arrival tells, and the search.
 
-    whole: with the filter over the entire trial, as a recording of many segments needs it.
+    whole: with the filter over the entire trial, as a recording of many segments needs it; share: see
+    `filter_trial`.
     """
-    marks = (jnp.asarray(batch.segment_at), jnp.asarray(batch.starts))
-    samples = Samples(trial.signal, trial.period, trial.variance)
-    table = arrivals(samples, trial.rows, *marks, 1)
+    table = batch.table(trial)
     stop = len(trial.period) if whole else int(batch.departure[0]) + 1
     first = jax.tree.map(lambda x: x[:stop] if np.ndim(x) and len(x) == len(trial.period) else x, trial)
-    states, covariances = filter_trial(first, first.signal, jnp.asarray(UNFILLED))
-    state = jax.tree.map(lambda x: x[batch.departure], states)
-    sizes = padded_sizes(int(batch.arrival[0] - batch.departure[0]), 32, factor=2)
+    states, covariances = filter_trial(first, first.signal, jnp.asarray(share))
+    state, covariance = jax.tree.map(lambda x: x[batch.departure], (states, covariances))
     return solve_segments(
-        trial, state, covariances[batch.departure], table, batch.departure, batch.arrival, sizes, OPTIONS
+        trial, state, covariance, table, batch.departure, batch.arrival, batch.sizes, options
     )
 
 
