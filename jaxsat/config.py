@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxsat.errors import InputError
 
-Method = Literal["standard", "direct", "triangle", "quadratic"]
+Method = Literal["standard", "direct", "triangle", "quadratic", "map"]
 RailSetting = Literal["auto", "none"] | float
 
 

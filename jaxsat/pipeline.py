@@ -167,18 +167,22 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         clock.lap("compensation")
         # A filled value is known to lie within its bounds, no better.
         filled = eqx.tree_at(
-            lambda t: (t.signal, t.variance), trial, (fills.signal, trial.variance + trial.fill_variance)
+            lambda t: (t.signal, t.variance), trial, (fills.signal, trial.variance + fills.variance)
         )
         smoothed, floor = _smooth(filled, config)
         clock.lap("smoother")
 
     n = len(recording)
-    fills = eqx.tree_at(lambda f: (f.signal, f.at_bound), fills, (fills.signal[:n], fills.at_bound[:n]))
+    fills = eqx.tree_at(
+        lambda f: (f.signal, f.variance, f.at_bound),
+        fills,
+        (fills.signal[:n], fills.variance[:n], fills.at_bound[:n]),
+    )
     if floor is not None:
         floor = eqx.tree_at(lambda f: f.active, floor, floor.active[:n])
     offsets = np.concatenate([prepared.gyr_offset, np.zeros(3)])
     filled = np.where(prepared.sign != 0, fills.signal + offsets, recording.signal)
-    variance = trial.variance + (trial.fill_variance if compensated else 0.0)
+    variance = trial.variance[:n] + (fills.variance if compensated else 0.0)
     return Estimate(
         recording=recording,
         config=config,
@@ -195,7 +199,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         gaps=gaps,
         sign=prepared.sign,
         filled=filled,
-        signal_sd=np.sqrt(variance)[:n],
+        signal_sd=np.sqrt(variance),
         fills=fills,
         standard_position=np.asarray(standard.state.position)[:n],
         cost=np.asarray(smoothed.cost),

@@ -30,7 +30,7 @@ from problems import OPTIONS, Batch, bars, run_direct, strapdown_seconds, walk, 
 from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.smoother import smooth_about
 from jaxsat.pipeline import _smooth, estimate, prepare
-from jaxsat.saturation.compensate import UNFILLED, filter_trial
+from jaxsat.saturation.compensate import filter_trial
 from jaxsat.saturation.layout import gather
 from jaxsat.saturation.segment import condense, value_gradient_root
 from jaxsat.studies.boards import Row, read_board, worse, write_board
@@ -44,7 +44,7 @@ def objective_vs_strapdown() -> Iterator[Row]:
     batch = bars(256)
 
     def segment(trial):
-        states, covariances = filter_trial(trial, trial.signal, jnp.asarray(UNFILLED))
+        states, covariances = filter_trial(trial, trial.signal, trial.unfilled_variance)
         at = batch.departure[0]
         state = jax.tree.map(lambda x: x[at], states)
         found, _ = gather(
@@ -111,7 +111,7 @@ def paper_way_speedup() -> Iterator[Row]:
     segments = prepared.segments
     batch = Batch(prepared.trial, segments.departure, segments.arrival, segments.rest_end)
     tight = eqx.tree_at(lambda o: o.tolerance, OPTIONS, jnp.asarray(1e-5))
-    solve = partial(direct, batch=batch, whole=False, options=tight, share=0.0)
+    solve = partial(direct, batch=batch, whole=False, options=tight, sure=True)
     run, trial = jax.jit(solve), jax.tree.map(jnp.asarray, prepared.trial)
     found, values = run(trial)
     real = np.asarray(values.sample[0]) < len(recording)

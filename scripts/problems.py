@@ -14,7 +14,7 @@ from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import prepare, search_options
 from jaxsat.saturation.arrival import arrivals
-from jaxsat.saturation.compensate import UNFILLED, filter_trial, solve_segments
+from jaxsat.saturation.compensate import filter_trial, solve_segments
 from jaxsat.saturation.layout import Sizes, Trial, padded_sizes
 from jaxsat.saturation.methods import Options
 from jaxsat.signals.recording import Recording
@@ -79,16 +79,16 @@ def bars(trials: int, samples: int = 512, saturated: int = 32) -> Batch:
     return Batch(whole, segments.departure[busy], segments.arrival[busy], segments.rest_end[busy])
 
 
-def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, share: float = UNFILLED):
+def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, sure: bool = False):
     """δ of one trial from its arrays: filter to the departure, what the arrival tells, and the search.
 
-    whole: with the filter over the entire trial, as a recording of many segments needs it; share: see
-    `filter_trial`.
+    whole: with the filter over the entire trial, as a recording of many segments needs it; sure: take
+    saturated values before the departure as measured.
     """
     table = batch.table(trial)
     stop = len(trial.period) if whole else int(batch.departure[0]) + 1
     first = jax.tree.map(lambda x: x[:stop] if np.ndim(x) and len(x) == len(trial.period) else x, trial)
-    states, covariances = filter_trial(first, first.signal, jnp.asarray(share))
+    states, covariances = filter_trial(first, first.signal, jnp.where(sure, 0.0, first.unfilled_variance))
     state, covariance = jax.tree.map(lambda x: x[batch.departure], (states, covariances))
     return solve_segments(
         trial, state, covariance, table, batch.departure, batch.arrival, batch.sizes, options

@@ -23,6 +23,7 @@ from jaxsat.saturation.layout import (
     padded_sizes,
 )
 from jaxsat.saturation.methods import Options, SegmentFill, solve_segment
+from jaxsat.saturation.prior import learn
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.rests import Segments
 
@@ -37,6 +38,8 @@ class Fills(eqx.Module):
     """The filled signal, and how each segment ended (one row a segment)."""
 
     signal: Float[np.ndarray, "N 6"]
+    variance: Float[np.ndarray, "N 6"]
+    """What a filled value adds to the sensor's noise."""
     at_bound: Bool[np.ndarray, "N 6"]
     """Values where the bound decided, not the data."""
     status: Int[np.ndarray, "S"]
@@ -51,6 +54,7 @@ class Fills(eqx.Module):
         zeros = np.zeros(count)
         return Fills(
             signal=np.array(trial.signal),
+            variance=np.array(trial.unfilled_variance),
             at_bound=np.zeros(trial.signal.shape, bool),
             status=np.full(count, int(Status.NOTHING_TO_DO)),
             cost_before=zeros,
@@ -69,6 +73,7 @@ class Fills(eqx.Module):
         self.signal[sample, channel] = (
             trial.signal[sample, channel] + trial.sign[sample, channel] * found.delta[real]
         )
+        self.variance[sample, channel] = found.variance[real]
         self.at_bound[sample, channel] = found.at_bound[real]
         self.status[segments] = found.solution.status
         self.cost_before[segments], self.cost_after[segments] = found.cost_before, found.solution.value
@@ -79,20 +84,15 @@ class Fills(eqx.Module):
 
 
 def filter_trial(
-    trial: Trial, signal: Float[Arrays, "N 6"], share: Float[Arrays, ""]
+    trial: Trial, signal: Float[Arrays, "N 6"], extra: Float[Arrays, "N 6"]
 ) -> tuple[NavState, Float[Array, "N1 s s"]]:
     """The departures of all segments: one filter pass over the recording with a filled signal.
 
-    Methods 1 and 2 do not say how sure they are of a filled value, so each enters with `share` times the variance
-    that its bounds leave: departures know how uncertain their tilt is, and one bad fill does not bend what follows.
+    extra: variance beyond the sensor's. With that of filled values departures know how uncertain their tilt is, and
+    one bad fill does not bend what follows.
     """
-    samples = Samples(signal, trial.period, trial.variance + share * trial.fill_variance)
+    samples = Samples(signal, trial.period, trial.variance + extra)
     return closed_loop(samples, trial.rows, trial.prior, trial.prior_covariance, trial.gravity)
-
-
-# A filled value lies anywhere within its bounds; where none is filled yet, δ is 0 and its variance the second
-# moment about that end, four times as much.
-UNFILLED, FILLED = 4.0, 1.0
 
 
 def solve_segments(
@@ -106,9 +106,14 @@ def solve_segments(
     options: Options,
 ) -> tuple[SegmentFill, Values]:
     """Some segments of a recording side by side, from the filtered states at their departures."""
+    prior = None
+    if options.method == "map":
+        moving = ~jnp.asarray(trial.rows.rest)
+        channels = (jnp.asarray(x) for x in (trial.signal, trial.sign, trial.clean))
+        prior = learn(*channels, moving, jnp.asarray(trial.period)[0])
 
     def solve(state, covariance, table, departure, arrival):
-        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes)
+        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
         return solve_segment(segment, jnp.asarray(trial.gravity), options), values
 
     return jax.vmap(solve)(states, covariances, table, departure, arrival)
@@ -157,8 +162,8 @@ def compensate_parallel(
     table = arrival_table(trial, segments)
     chunks = list(_chunks(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
-    for sweep in range(sweeps):
-        filtered = _filter(trial, fills.signal, np.asarray(UNFILLED if sweep == 0 else FILLED))
+    for _ in range(sweeps):
+        filtered = _filter(trial, fills.signal, fills.variance)
         filtered = jax.tree.map(np.asarray, filtered)
         for mine, sizes in chunks:
             at = np.maximum(segments.departure[mine], 0)
@@ -194,7 +199,7 @@ def compensate_sequential(
     state, covariance, at = trial.prior, trial.prior_covariance, 0
     for count, index in enumerate(busy.tolist()):
         departure = max(0, int(segments.departure[index]))
-        state, covariance = _filter_to(trial, fills.signal, state, covariance, at, departure)
+        state, covariance = _filter_to(trial, fills, state, covariance, at, departure)
         at = departure
         here = jax.tree.map(lambda x: np.asarray(x)[None], (state, covariance))
         _solve_some(trial, here, table, segments, np.array([index]), sizes, options, fills)
@@ -203,7 +208,7 @@ def compensate_sequential(
     return fills
 
 
-def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, stop: int):
+def _filter_to(trial: Trial, fills: Fills, state: NavState, covariance, start: int, stop: int):
     """The filtered state at sample `stop`, from that at `start` (whose rows are used already, but at 0)."""
     count = stop - start + 1
     size = bucket(count, 256)
@@ -225,5 +230,5 @@ def _filter_to(trial: Trial, signal, state: NavState, covariance, start: int, st
         prior_covariance=covariance,
         gravity=trial.gravity,
     )
-    states, covariances = _filter(part, span(signal), np.asarray(FILLED))
+    states, covariances = _filter(part, span(fills.signal), span(fills.variance))
     return jax.tree.map(lambda x: np.asarray(x[count - 1]), states), np.asarray(covariances[count - 1])

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState
 from jaxsat.saturation.gap_shapes import Edges, edge_slope
+from jaxsat.saturation.prior import SignalPrior, of_values
 from jaxsat.saturation.segment import Segment
 from jaxsat.signals.rests import Segments
 
@@ -35,9 +36,9 @@ class Trial(eqx.Module):
     gravity: Float[Arrays, ""]
 
     @property
-    def fill_variance(self) -> Float[Arrays, "N 6"]:
-        """Variance of a filled value of which only the bounds are known: uniform in 0 ≤ δ ≤ δ_b."""
-        return jnp.where(jnp.asarray(self.sign) != 0, jnp.asarray(self.bound**2 / 12.0)[None], 0.0)
+    def unfilled_variance(self) -> Float[Arrays, "N 6"]:
+        """Of a saturated value while δ is 0: the second moment about that end of what its bounds leave."""
+        return jnp.where(jnp.asarray(self.sign) != 0, jnp.asarray(self.bound**2 / 3.0)[None], 0.0)
 
     def padded(self) -> "Trial":
         """With blank samples behind the end, to a length that recordings of about the same length share."""
@@ -105,10 +106,11 @@ def gather(
     covariance: Float[Array, "s s"],
     table: Float[Array, "10 10"],
     sizes: Sizes,
+    prior: SignalPrior | None = None,
 ) -> tuple[Segment, Values]:
     """One segment, padded; [departure, arrival) are its samples.
 
-    state, covariance: of the filter at departure; table: Λ of the arrival.
+    state, covariance: of the filter at departure; table: Λ of the arrival; prior: of the signal, for `map`.
     """
     n, m = sizes
     count = len(trial.signal)
@@ -131,6 +133,11 @@ def gather(
     height = None
     if trial.rows.height is not None:
         height = (arrival < count) & jnp.asarray(trial.rows.height)[jnp.minimum(arrival, count - 1)]
+    place = Values(jnp.where(valid, start + sample, count), channel)
+    way = jnp.where(valid, sign[sample, channel], 0).astype(signal.dtype)
+    known = None
+    if prior is not None:
+        known = of_values(prior, jnp.asarray(trial.signal), start + sample, channel, way)
     segment = Segment(
         signal=signal,
         period=window(trial.period),
@@ -139,7 +146,7 @@ def gather(
         cut=cut,
         element=jnp.where(valid, jnp.searchsorted(cut, sample), 0),
         channel=channel,
-        sign=jnp.where(valid, sign[sample, channel], 0).astype(signal.dtype),
+        sign=way,
         bound=jnp.where(valid, jnp.asarray(trial.bound)[channel], 0.0),
         gap=gap,
         edges=edges,
@@ -148,8 +155,9 @@ def gather(
         arrival=table,
         height=height,
         height_variance=jnp.asarray(trial.rows.height_variance),
+        known=known,
     )
-    return segment, Values(jnp.where(valid, start + sample, count), channel)
+    return segment, place
 
 
 def _gaps(trial: Trial, signal, sign, start, sample, channel, valid, size: int):

@@ -9,10 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.saturation.gap_shapes import peak, shape_value
+from jaxsat.saturation.prior import spread
 from jaxsat.saturation.segment import Segment, condense, value_and_root, value_gradient_root
-from jaxsat.saturation.solvers import Box, Solution, Status, projected_gauss_newton, projected_gradient
+from jaxsat.saturation.solvers import (
+    Box,
+    Solution,
+    Status,
+    dense_box_step,
+    projected_gauss_newton,
+    projected_gradient,
+)
 
-Compensation = Literal["direct", "triangle", "quadratic"]
+Compensation = Literal["direct", "triangle", "quadratic", "map"]
 Solver = Literal["gauss_newton", "projected_gradient"]
 _SOLVERS = {"gauss_newton": projected_gauss_newton, "projected_gradient": projected_gradient}
 
@@ -28,8 +36,13 @@ class Search(eqx.Module):
 def search_space(method: Compensation, segment: Segment, free_peak_time: bool = False) -> Search:
     """Method 1 (`direct`) searches every δ from 0; method 2 the height of each gap, from half of its range.
 
+    `map` searches every δ from where the signal prior alone puts it.
     free_peak_time: method 2 also searches where in the gap the peak lies, instead of fixing it by Eq. 21.
     """
+    if method == "map" and segment.known is not None:
+        nothing = jnp.zeros_like(segment.bound)
+        start = dense_box_step(segment.known.slope, segment.known.precision, nothing, segment.bound)
+        return Search(lambda delta: delta, segment.bound, start)
     if method == "direct":
         return Search(lambda delta: delta, segment.bound, jnp.zeros_like(segment.bound))
     edges = segment.edges
@@ -67,6 +80,8 @@ class SegmentFill(eqx.Module):
     cost_before: Float[Array, ""]
     """f(0)."""
     solution: Solution
+    variance: Float[Array, "m"]
+    """What a smoother should add to the noise of each filled value."""
     at_bound: Bool[Array, "m"]
     """δ ends at its bound: the bound decided, not the data."""
 
@@ -84,15 +99,18 @@ class Options(eqx.Module):
 def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options) -> SegmentFill:
     """min over δ of f(δ), bounded one-sided (Eq. 18-20), through the inner minimum.
 
-    A segment that no rest follows (its arrival is zero) keeps δ = 0 and says so; a search that ends above
-    f(0) keeps δ = 0 too.
+    A segment that no rest follows (its arrival is zero) says so; it keeps δ = 0, or with `map` what the prior
+    alone gives. A search that ends above f(0) keeps δ = 0 too.
     """
     search = search_space(options.method, segment, options.free_peak_time)
-    condensed = condense(segment)
+    condensed, known = condense(segment), segment.known
 
     def linearise(p):
         delta, back = jax.vjp(search.delta, p)
         value, gradient, columns = value_gradient_root(delta, condensed, gravity)
+        if known is not None:
+            pull = known.precision @ delta
+            value, gradient = value + delta @ (known.slope + 0.5 * pull), gradient + known.slope + pull
         return value, *jax.tree.map(lambda x: back(x)[0], (gradient, columns))
 
     # f(0), and the curvature at the start; both from one compiled evaluation.
@@ -102,6 +120,8 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     )
     before = values[0]
     curvature = sum(back(column[1])[0] ** 2 for column in columns)
+    if known is not None:
+        curvature = curvature + jnp.diagonal(known.precision)
     # A variable that the data do not see is scaled by its range; one without range does not move.
     has_range = search.upper > 0.0
     scale = jnp.where(
@@ -114,10 +134,13 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
         scale=scale,
         tolerance=options.tolerance,
         max_iterations=options.max_iterations,
+        precision=None if known is None else known.precision,
     )
     solution = _SOLVERS[options.solver](linearise, box)
     blind = ~jnp.any(segment.arrival != 0.0)
-    keep = blind | (solution.value > before)
+    keep = solution.value > before
+    if known is None:
+        keep = keep | blind
     delta = jnp.where(keep, 0.0, search.delta(solution.x))
     solution = eqx.tree_at(
         lambda s: (s.status, s.value),
@@ -127,5 +150,10 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
             jnp.where(keep, before, solution.value),
         ),
     )
-    at_bound = (segment.bound > 0.0) & (delta >= segment.bound * (1.0 - 1e-9))
-    return SegmentFill(delta=delta, cost_before=before, solution=solution, at_bound=at_bound)
+    real = segment.bound > 0.0
+    # Where no prior says better, a value lies anywhere within its bounds: uniform in 0 ≤ δ ≤ δ_b.
+    variance = segment.bound**2 / 12.0 if known is None else spread(known, segment.gap, real)
+    at_bound = real & (delta >= segment.bound * (1.0 - 1e-9))
+    return SegmentFill(
+        delta=delta, cost_before=before, solution=solution, variance=variance, at_bound=at_bound
+    )

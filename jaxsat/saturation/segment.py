@@ -26,6 +26,7 @@ from jaxsat.inertial.components import Cholesky, Matrix, Quaternion, Scalar, Vec
 from jaxsat.inertial.preintegration import Passage, Stretch, passage, stretches
 from jaxsat.inertial.strapdown import NavState
 from jaxsat.saturation.gap_shapes import Edges
+from jaxsat.saturation.prior import Known
 
 # The smoother's order is [θ, r, v]; here position comes last, so that it can be left out.
 _POSITION_LAST = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])
@@ -63,6 +64,8 @@ class Segment(eqx.Module):
     height: Bool[Array, ""] | None
     """Whether the arrival is at height zero; None where heights are not used at all."""
     height_variance: Float[Array, ""]
+    known: Known | None = None
+    """What the signal prior says of δ, for the method `map`."""
 
 
 class Condensed(eqx.Module):

@@ -63,6 +63,8 @@ class Box(eqx.Module):
     tolerance: float | Float[Array, ""]
     """Of the solution's residual."""
     max_iterations: int | Int[Array, ""]
+    precision: Float[Array, "n n"] | None = None
+    """Curvature that the value has besides A Aᵀ; None for none."""
 
     def scaled(self) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
         """Start, moved into the box, and the bounds, in u = x / scale."""
@@ -149,11 +151,16 @@ _DAMPING = (1.0, 1e-2, 1e6)
 def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
     """The same problem by Gauss-Newton steps within the box, damped after Levenberg and Marquardt.
 
-    The Hessian has a low rank, so most directions are free: damping takes the shortest of the steps (in scaled
-    variables) that the data cannot tell apart. One evaluation a step; a step that does not pay is not taken.
+    Without `precision` the Hessian has a low rank, so most directions are free: damping takes the shortest of the
+    steps (in scaled variables) that the data cannot tell apart. One evaluation a step; a step that does not pay is
+    not taken.
     """
     u, low, high = box.scaled()
     first, least, most = _DAMPING
+    known = None if box.precision is None else box.precision * box.scale[:, None] * box.scale[None]
+    if known is not None:
+        # The prior tells apart what the data do not, so a full step may be tried at once.
+        first = least
     rank = len(jax.eval_shape(linearise, box.start)[2])
 
     def proceed(carry):
@@ -173,9 +180,17 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
         factor = jnp.where((kept > 0.75) | level, 0.1, jnp.where(kept > 0.25, 1.0, 8.0))
         damping = jnp.where(count == 0, damping, jnp.maximum(damping * factor, least))
         _, gradient, columns, _ = at
-        there = jnp.clip(u + box_step(gradient, columns, damping, low - u, high - u), low, high)
+        if known is None:
+            d = box_step(gradient, columns, damping, low - u, high - u)
+        else:
+            A = jnp.stack(columns, axis=1)
+            hessian = known + A @ A.T + damping * jnp.eye(len(u))
+            d = dense_box_step(gradient, hessian, low - u, high - u)
+        there = jnp.clip(u + d, low, high)
         d = there - u
         promised = -jnp.sum(gradient * d) - 0.5 * sum(jnp.sum(a * d) ** 2 for a in columns)
+        if known is not None:
+            promised = promised - 0.5 * d @ (known @ d)
         return u, there, at, promised, damping, count + 1
 
     infinite, zero = jnp.full((), jnp.inf, u.dtype), jnp.zeros((), u.dtype)
@@ -258,3 +273,35 @@ def box_step(
     start = (tuple(zero for _ in rank), gradient, jnp.full_like(damping, jnp.inf), jnp.asarray(0))
     _, pull, _, _ = jax.lax.while_loop(proceed, newton, start)
     return primal(pull)
+
+
+def dense_box_step(
+    gradient: Float[Array, "n"],
+    hessian: Float[Array, "n n"],
+    low: Float[Array, "n"],
+    high: Float[Array, "n"],
+) -> Float[Array, "n"]:
+    """min over low ≤ d ≤ high of gᵀd + ½ dᵀHd with H positive definite, by projected Newton (Bertsekas 1982).
+
+    Variables at a bound that their slope pushes against are held; the others take a Newton step, shortened until
+    the value of its projection is least.
+    """
+    fractions = jnp.asarray(0.5 ** np.arange(12.0), gradient.dtype)[:, None]
+
+    def newton(carry):
+        d, _, count = carry
+        slope = gradient + hessian @ d
+        held = ((d <= low) & (slope >= 0.0)) | ((d >= high) & (slope <= 0.0))
+        masked = jnp.where(held[:, None] | held[None], jnp.diag(jnp.where(held, 1.0, 0.0)), hessian)
+        step = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(masked), True), jnp.where(held, 0.0, slope))
+        tried = jnp.clip(d[None] + fractions * step[None], low[None], high[None])
+        value = tried @ gradient + 0.5 * jnp.sum(tried * (tried @ hessian), axis=1)
+        best = tried[jnp.argmin(value)]
+        return best, jnp.max(jnp.abs(best - d)), count + 1
+
+    def proceed(carry):
+        d, change, count = carry
+        return (change > 1e-10 * (1.0 + jnp.max(jnp.abs(d)))) & (count < 50)
+
+    start = jnp.clip(jnp.zeros_like(gradient), low, high)
+    return jax.lax.while_loop(proceed, newton, (start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0)))[0]

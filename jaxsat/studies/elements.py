@@ -13,7 +13,7 @@ from jaxsat.config import Config
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import Prepared
-from jaxsat.saturation.compensate import FILLED, UNFILLED, arrival_table, filter_trial, solve_segments
+from jaxsat.saturation.compensate import arrival_table, filter_trial, solve_segments
 from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
 from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
@@ -168,22 +168,23 @@ def score(
     if standard:
         path = _smooth_path(trial, signal, trial.variance, relinearisations)
         found["standard"] = compared(path, signal)
-    at = jnp.maximum(case.departure, 0)
+    at, unfilled = jnp.maximum(case.departure, 0), trial.unfilled_variance
     for option in options:
 
-        def once(filled, share, option=option):
-            states, covariances = jax.tree.map(lambda x: x[at], filter_trial(trial, filled, share))
+        def once(before, _, option=option):
+            states, covariances = jax.tree.map(lambda x: x[at], filter_trial(trial, *before))
             fill, values = solve_segments(
                 trial, states, covariances, case.table, case.departure, case.arrival, sizes, option
             )
             place = (values.sample, values.channel)
             way = sign.at[place].get(mode="fill", fill_value=0)
-            return signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop"), (fill, values)
+            filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")
+            return (filled, unfilled.at[place].set(fill.variance, mode="drop")), (fill, values)
 
         # A loop, not a repetition: the program is compiled once.
-        filled, every = jax.lax.scan(once, signal, jnp.asarray([UNFILLED] + [FILLED] * (sweeps - 1)))
+        (filled, extra), every = jax.lax.scan(once, (signal, unfilled), None, length=sweeps)
         fill, values = jax.tree.map(lambda x: x[-1], every)
-        path = _smooth_path(trial, filled, trial.variance + trial.fill_variance, relinearisations)
+        path = _smooth_path(trial, filled, trial.variance + extra, relinearisations)
         busy = jnp.any(values.sample < count, axis=1)
         order = jnp.asarray([_SEVERITY.index(status) for status in sorted(Status)])
         worst = jnp.max(jnp.where(busy, order[fill.solution.status], 0))
