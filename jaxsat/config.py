@@ -82,6 +82,12 @@ class Smoother(_Section):
     gyr_offset: Literal["first_rest", "none"] = Field(
         default="first_rest", description="constant rate to remove"
     )
+    gyr_bias_sd: float = Field(
+        default=1e-3, gt=0, description="sd of the rate bias that is left, for the method map (rad/s)"
+    )
+    acc_bias_sd: float = Field(
+        default=0.05, gt=0, description="sd of the accelerometer's bias, for the method map (m/s²)"
+    )
 
 
 class Config(_Section):

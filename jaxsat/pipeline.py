@@ -139,6 +139,7 @@ def search_options(config: Config, method: str) -> Options:
         chosen.free_peak_time,
         jnp.asarray(chosen.max_iterations),
         jnp.asarray(chosen.tolerance),
+        jnp.repeat(jnp.array([config.smoother.gyr_bias_sd, config.smoother.acc_bias_sd]), 3),
     )
 
 
@@ -167,7 +168,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         clock.lap("compensation")
         # A filled value is known to lie within its bounds, no better.
         filled = eqx.tree_at(
-            lambda t: (t.signal, t.variance), trial, (fills.signal, trial.variance + fills.variance)
+            lambda t: (t.signal, t.variance), trial, (fills.unbiased, trial.variance + fills.variance)
         )
         smoothed, floor = _smooth(filled, config)
         clock.lap("smoother")

@@ -1,6 +1,7 @@
 """All segments of a recording, in parallel or one after the other (paper A, Section 5)."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsat.inertial.biases import estimate_biases
 from jaxsat.inertial.smoother import closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
@@ -40,6 +42,8 @@ class Fills(eqx.Module):
     signal: Float[np.ndarray, "N 6"]
     variance: Float[np.ndarray, "N 6"]
     """What a filled value adds to the sensor's noise."""
+    bias: Float[np.ndarray, "6"]
+    """Of the sensors (rad/s, m/s²); zero unless the method is `map`."""
     at_bound: Bool[np.ndarray, "N 6"]
     """Values where the bound decided, not the data."""
     status: Int[np.ndarray, "S"]
@@ -49,12 +53,18 @@ class Fills(eqx.Module):
     residual: Float[np.ndarray, "S"]
     iterations: Int[np.ndarray, "S"]
 
+    @property
+    def unbiased(self) -> Float[np.ndarray, "N 6"]:
+        """The filled signal without the biases."""
+        return self.signal - self.bias[None]
+
     @staticmethod
     def nothing(trial: Trial, count: int) -> "Fills":
         zeros = np.zeros(count)
         return Fills(
             signal=np.array(trial.signal),
             variance=np.array(trial.unfilled_variance),
+            bias=np.zeros(6),
             at_bound=np.zeros(trial.signal.shape, bool),
             status=np.full(count, int(Status.NOTHING_TO_DO)),
             cost_before=zeros,
@@ -71,7 +81,9 @@ class Fills(eqx.Module):
         real = values.sample < len(trial.signal)
         sample, channel = values.sample[real], values.channel[real]
         self.signal[sample, channel] = (
-            trial.signal[sample, channel] + trial.sign[sample, channel] * found.delta[real]
+            trial.signal[sample, channel]
+            + self.bias[channel]
+            + trial.sign[sample, channel] * found.delta[real]
         )
         self.variance[sample, channel] = found.variance[real]
         self.at_bound[sample, channel] = found.at_bound[real]
@@ -119,6 +131,14 @@ def solve_segments(
     return jax.vmap(solve)(states, covariances, table, departure, arrival)
 
 
+@eqx.filter_jit
+def _bias(trial: Trial, signal, extra, sd, start) -> Float[Array, "6"]:
+    samples = Samples(signal, trial.period, trial.variance + extra)
+    return estimate_biases(
+        samples, trial.rows, trial.prior, trial.prior_covariance, trial.gravity, sd, 1, start
+    )[0]
+
+
 _filter = eqx.filter_jit(filter_trial)
 _solve = eqx.filter_jit(solve_segments)
 
@@ -163,15 +183,19 @@ def compensate_parallel(
     chunks = list(_chunks(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
     for _ in range(sweeps):
-        filtered = _filter(trial, fills.signal, fills.variance)
+        filtered = _filter(trial, fills.unbiased, fills.variance)
         filtered = jax.tree.map(np.asarray, filtered)
+        shifted = eqx.tree_at(lambda t: t.signal, trial, trial.signal - fills.bias[None])
         for mine, sizes in chunks:
             at = np.maximum(segments.departure[mine], 0)
             departures = jax.tree.map(lambda x, at=at: x[at], filtered)
-            _solve_some(trial, departures, table, segments, mine, sizes, options, fills)
+            _solve_some(shifted, departures, table, segments, mine, sizes, options, fills)
             done += len(mine)
             if progress:
                 progress(done, sweeps * total)
+        if options.method == "map":
+            bias = _bias(trial, fills.signal, fills.variance, options.bias_sd, fills.bias)
+            fills = replace(fills, bias=np.asarray(bias))
     return fills
 
 
