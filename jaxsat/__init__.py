@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxsat.config import Config, load_config
     from jaxsat.errors import InputError
+    from jaxsat.orient import Orientation, orient
     from jaxsat.pipeline import Estimate, Trajectory, estimate
     from jaxsat.present.folder import write_results
     from jaxsat.signals.readers import read
@@ -24,11 +25,13 @@ _HOME = {
     "Estimate": "jaxsat.pipeline",
     "InputError": "jaxsat.errors",
     "MOTIONS": "jaxsat.studies.motions",
+    "Orientation": "jaxsat.orient",
     "Recording": "jaxsat.signals.recording",
     "Sensor": "jaxsat.studies.simulate",
     "Trajectory": "jaxsat.pipeline",
     "estimate": "jaxsat.pipeline",
     "load_config": "jaxsat.config",
+    "orient": "jaxsat.orient",
     "position_rmse": "jaxsat.studies.metrics",
     "read": "jaxsat.signals.readers",
     "simulate": "jaxsat.studies.simulate",
@@ -41,11 +44,13 @@ __all__ = [  # noqa: RUF022 (the order of _HOME)
     "Estimate",
     "InputError",
     "MOTIONS",
+    "Orientation",
     "Recording",
     "Sensor",
     "Trajectory",
     "estimate",
     "load_config",
+    "orient",
     "position_rmse",
     "read",
     "simulate",

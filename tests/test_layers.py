@@ -13,6 +13,7 @@ ORDER = (
     "saturation",
     "config",
     "pipeline",
+    "orient",
     "studies",
     "present",
     "demo",

@@ -121,10 +121,14 @@ def orientation(
     """
     if estimate == "smoothed":
         return _smoothed(signal, period, trusted, start, gains, update, direction)
-    return _run(signal, period, trusted, start, jnp.zeros(3, signal.dtype), gains, estimate, update, direction)
+    return _run(
+        signal, period, trusted, start, jnp.zeros(3, signal.dtype), gains, estimate, update, direction
+    )
 
 
-def _run(signal, period, trusted, start: Start, integral, gains: Gains, estimate, update, direction) -> Attitude:
+def _run(
+    signal, period, trusted, start: Start, integral, gains: Gains, estimate, update, direction
+) -> Attitude:
     def step(state, sample):
         q, force, learnt = state
         rate, specific, T, trust = sample
@@ -152,9 +156,7 @@ def _run(signal, period, trusted, start: Start, integral, gains: Gains, estimate
     initial = (Quaternion.of(start.q_nb), up, Vector.of(integral))
     samples = (signal[:, :3], signal[:, 3:], period, trusted.astype(signal.dtype))
     _, (q_nb, learnt) = jax.lax.scan(step, initial, samples)
-    return Attitude(
-        jnp.concatenate([start.q_nb[None], q_nb]), jnp.concatenate([integral[None], learnt])
-    )
+    return Attitude(jnp.concatenate([start.q_nb[None], q_nb]), jnp.concatenate([integral[None], learnt]))
 
 
 def _smoothed(signal, period, trusted, start: Start, gains: Gains, update, direction) -> Attitude:
