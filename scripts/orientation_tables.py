@@ -102,11 +102,13 @@ def at_rest(recording: Recording, name: str) -> list[dict]:
 
 def static_table(c: dict, data: Path) -> pd.DataFrame:
     device, duration = c["sensor"], c["static"]["duration"]
-    still = Joint(start=duration + 1.0)
-    recording, _ = simulate(
-        still, rate=device["rate_hz"], duration=duration, sensor=sensor(device), key=jax.random.key(2014)
-    )
-    rows = at_rest(warmed(recording, device), "simulated, 300 s")
+    still, rows = Joint(start=duration + 1.0), []
+    for seed in range(c["static"]["seeds"]):
+        recording, _ = simulate(
+            still, rate=device["rate_hz"], duration=duration, sensor=sensor(device), key=jax.random.key(seed)
+        )
+        rows += at_rest(warmed(recording, device), "simulated, 300 s")
+    simulated = pd.DataFrame(rows).groupby(["recording", "estimate"], sort=False).mean().reset_index()
     real = read(data / "xio" / "fusion_sensor_data.csv")
     first, last = (int(np.searchsorted(real.time, t)) for t in c["static"]["tail"])
     tail = Recording(
@@ -116,7 +118,7 @@ def static_table(c: dict, data: Path) -> pd.DataFrame:
         real.missing[first:last],
         name="tail",
     )
-    return pd.DataFrame(rows + at_rest(tail, "real, 32 s"))
+    return pd.concat([simulated, pd.DataFrame(at_rest(tail, "real, 32 s"))], ignore_index=True)
 
 
 def moving_table(c: dict, data: Path) -> pd.DataFrame:

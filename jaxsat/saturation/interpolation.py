@@ -14,7 +14,7 @@ from jaxsat.signals.rests import runs
 
 REACH = 0.25
 """How far to either side of a gap samples are looked at (s)."""
-_LEARN_FROM = 40
+_LEARN_FROM = 20
 # A kernel matrix of close samples is singular to rounding: noise never counts as less than this share of the size.
 _LEAST_NOISE = 1e-3
 
