@@ -17,6 +17,8 @@ from jaxsat.signals.recording import Recording
 
 FIRST = 1.0
 """The offset of the gyroscope is its mean over so long a rest at the start (s)."""
+LONG_GAP = 0.1
+"""Neighbours say little of a gap that lasts longer (s): a hand or a foot changes its rate within such a time."""
 # One compilation for recordings of about the same length.
 _BLOCK = 8192
 
@@ -76,7 +78,13 @@ def orient(recording: Recording, config: Config | None = None) -> Orientation:
         found, angles = _attitude(
             *padded, start, gains, settings.estimate, settings.update, settings.direction
         )
-    n = len(recording)
+    n, gaps = len(recording), find_gaps(sign)
+    long = int(np.sum((gaps.end - gaps.start)[gaps.channel < 3] > LONG_GAP / period))
+    if long and settings.fill == "interpolate":
+        warnings.append(
+            f"{recording.name}: {long} gaps in the rates last longer than {LONG_GAP:g} s: what fills them is a "
+            "guess, and the attitude after them may be far off."
+        )
     q_nb = np.asarray(found.q_nb)
     return Orientation(
         recording=recording,
@@ -88,7 +96,7 @@ def orient(recording: Recording, config: Config | None = None) -> Orientation:
         start=jax.tree.map(np.asarray, start),
         gains=jax.tree.map(np.asarray, gains),
         rails=rails,
-        gaps=find_gaps(sign),
+        gaps=gaps,
         sign=sign,
         filled=filled,
         warnings=warnings,

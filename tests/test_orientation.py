@@ -349,14 +349,24 @@ def test_orient_follows_a_recording_and_takes_its_offset_off():
 def test_flagged_saturation_of_the_rate_is_filled():
     signal, angle = simulated()
     clipped = np.zeros((600, 6), bool)
-    clipped[:, 0] = np.abs(signal[:, 0]) > 3.0
+    clipped[:, 0] = np.abs(signal[:, 0]) > 4.5
     cut = signal.copy()
-    cut[:, 0] = np.clip(cut[:, 0], -3.0, 3.0)
+    cut[:, 0] = np.clip(cut[:, 0], -4.5, 4.5)
     errors = {}
     for fill in ("none", "interpolate"):
         found = orient(recording(cut, clipped=clipped), load_config(None, **{"orientation.fill": fill}))
         errors[fill] = np.abs(found.euler[:, 0] - angle).max()
-    assert errors["interpolate"] < 0.3 * errors["none"] and errors["none"] > 0.05
+        assert [w for w in found.warnings if "gaps in the rates" in w] == []
+    assert errors["interpolate"] < 0.5 * errors["none"] and errors["none"] > 0.02
+
+
+def test_gaps_too_long_to_be_filled_from_their_neighbours_are_said():
+    signal, _ = simulated()
+    clipped = np.zeros((600, 6), bool)
+    clipped[:, 0] = np.abs(signal[:, 0]) > 0.7
+    signal[:, 0] = np.clip(signal[:, 0], -0.7, 0.7)
+    (warning,) = orient(recording(signal, clipped=clipped)).warnings
+    assert "gaps in the rates last longer than 0.1 s" in warning
 
 
 @pytest.mark.parametrize(

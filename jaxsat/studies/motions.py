@@ -151,8 +151,9 @@ class Joint(Motion):
         quarters = jnp.clip((t - self.start) / self.quarter, 0.0, 4.0 * self.repetitions)
         phase = quarters - 4.0 * jnp.floor(quarters / 4.0)
         bend = _ramp(phase) - 2.0 * _ramp((phase - 1.0) / 2.0) + _ramp(phase - 3.0)
-        q_nb = quat_exp(self.angle * bend * self.axis)
-        return quat_rotate(q_nb, self.lever) - self.lever, q_nb
+        q_nb = quat_exp(self.angle * bend * jnp.asarray(self.axis))
+        lever = jnp.asarray(self.lever)
+        return quat_rotate(q_nb, lever) - lever, q_nb
 
 
 class Walk(Motion):
