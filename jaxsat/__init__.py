@@ -8,9 +8,9 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxsat.attitude import Orientation, orient
     from jaxsat.config import Config, load_config
     from jaxsat.errors import InputError
-    from jaxsat.orient import Orientation, orient
     from jaxsat.pipeline import Estimate, Trajectory, estimate
     from jaxsat.present.folder import write_results
     from jaxsat.signals.readers import read
@@ -25,13 +25,13 @@ _HOME = {
     "Estimate": "jaxsat.pipeline",
     "InputError": "jaxsat.errors",
     "MOTIONS": "jaxsat.studies.motions",
-    "Orientation": "jaxsat.orient",
+    "Orientation": "jaxsat.attitude",
     "Recording": "jaxsat.signals.recording",
     "Sensor": "jaxsat.studies.simulate",
     "Trajectory": "jaxsat.pipeline",
     "estimate": "jaxsat.pipeline",
     "load_config": "jaxsat.config",
-    "orient": "jaxsat.orient",
+    "orient": "jaxsat.attitude",
     "position_rmse": "jaxsat.studies.metrics",
     "read": "jaxsat.signals.readers",
     "simulate": "jaxsat.studies.simulate",

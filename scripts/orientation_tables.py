@@ -23,9 +23,9 @@ import numpy as np
 import pandas as pd
 from scipy.ndimage import uniform_filter1d
 
+from jaxsat.attitude import orient
 from jaxsat.config import Orientation, load_config
 from jaxsat.inertial.orientation import Direction, Gains, start_at_rest
-from jaxsat.orient import orient
 from jaxsat.signals.formats import GRAVITY
 from jaxsat.signals.readers import read
 from jaxsat.signals.recording import Recording
@@ -284,7 +284,7 @@ def broad_table(c: dict, data: Path, tuned: Table) -> Table:
         "jaxsat pi, Q_comp": partial(ours, estimate="pi", update="comp"),
         "jaxsat pi, Q_imp": partial(ours, estimate="pi", update="imp"),
         "jaxsat pi, gate 1 m/s²": partial(ours, estimate="pi", gate=1.0),
-        "jaxsat pi, tau 0": partial(ours, estimate="pi", tau=0.0, ki=0.0),
+        "jaxsat pi, tau 0, ki 0": partial(ours, estimate="pi", tau=0.0, ki=0.0),
         "jaxsat pi, Eq. 11, tau 0": partial(ours, **paper_form),
         "jaxsat pi, Eq. 11, tau 0, gate 1 m/s²": partial(ours, **paper_form, gate=1.0),
         "jaxsat pi, Good Gain": partial(ours, estimate="pi", gains="good_gain"),
@@ -357,14 +357,19 @@ def board(tables: dict[str, Table]) -> list[Row]:
     static = tables["static"].set_index(["recording", "estimate"])
     for recording, word in (("simulated, 300 s", "static"), ("real, 32 s", "tail")):
         gyro = static.loc[(recording, "gyro")]
-        forms = (("", "pi, Good Gain"), ("_default", "pi"), ("_smoothed", "smoothed"))
+        forms = (
+            ("", "pi, Good Gain, tau 0"),
+            ("_low_pass", "pi, Good Gain"),
+            ("_default", "pi"),
+            ("_smoothed", "smoothed"),
+        )
         for suffix, label in forms:
             pi = static.loc[(recording, label)]
             for axis, paper in zip("xy", PAPER["pi"][:2], strict=True):
                 note = f"{recording}, {label}; baseline: the gyroscope alone; the paper in 300 s: {paper:g}"
                 name, value = f"orientation_{word}_drift_{axis}{suffix}", pi[f"drift_{axis}"]
                 rows.append(Row(name, value, "deg", "lower", 0.1, gyro[f"drift_{axis}"], note))
-        pi = static.loc[(recording, "pi, Good Gain")]
+        pi = static.loc[(recording, "pi")]
         rows.append(
             Row(
                 f"orientation_{word}_drift_z",

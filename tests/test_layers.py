@@ -13,7 +13,7 @@ ORDER = (
     "saturation",
     "config",
     "pipeline",
-    "orient",
+    "attitude",
     "studies",
     "present",
     "demo",

@@ -78,7 +78,7 @@ def orientation_command(
     given = {f"orientation.{key}": value for key, value in given.items() if value is not None}
     settings = load_config(config, **given, **rail_overrides(gyr_rail, acc_rail, gyr_unit, acc_unit))
     use_compilation_cache()
-    from jaxsat.orient import orient
+    from jaxsat.attitude import orient
 
     found = orient(measured, settings)
     path = write_orientation(found, out, csv=csv, source=recording)

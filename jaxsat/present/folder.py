@@ -11,8 +11,8 @@ from typing import Any
 
 import pandas as pd
 
+from jaxsat.attitude import Orientation
 from jaxsat.errors import InputError
-from jaxsat.orient import Orientation
 from jaxsat.pipeline import Estimate
 from jaxsat.present.report import Track, render_report
 from jaxsat.present.summary import summarise, summarise_orientation

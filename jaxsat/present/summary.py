@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import pandas as pd
 
+from jaxsat.attitude import Orientation
 from jaxsat.config import Config
-from jaxsat.orient import Orientation
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.checks import check

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from jaxsat.orient import Orientation
+from jaxsat.attitude import Orientation
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import CHANNELS

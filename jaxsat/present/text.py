@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from jaxsat.orient import Orientation
+from jaxsat.attitude import Orientation
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
