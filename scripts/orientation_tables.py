@@ -461,8 +461,8 @@ def page(tables: dict[str, Table], notes: str) -> str:
         "# Orientation\n\nMade by `scripts/orientation_tables.py` with `configs/orientation/board.toml`; the numbers "
         "aimed at are in `board.md`, all of them in the CSV files. Degrees throughout.",
         "## At rest (the paper's Table 1)\n\nDrift between the means of the first and the last second; RMSE about a "
-        "running mean over one second. The simulated MPU-6050 (mean of five seeds) warms by 0.6 °C, which moves its zeros "
-        "as its data sheet says. z drifts with the gyroscope whatever the filter: structural.",
+        "running mean over one second. The simulated MPU-6050 (mean of five seeds) warms by 0.6 °C, which moves its "
+        "zeros as its data sheet says. z drifts with the gyroscope whatever the filter: structural.",
         markdown(tables["static"], 4),
         "## Moving (Table 2)\n\n±90° about each axis, six times in 30 s, the sensor so far from the joint on each "
         "axis (m). The paper: gyro 24.12 / 11.36 / 7.14 RMSE in x / y / z, PI 2.75 / 2.98 / 7.14.",
