@@ -8,6 +8,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxsat.attitude import Orientation, orient
     from jaxsat.config import Config, load_config
     from jaxsat.errors import InputError
     from jaxsat.pipeline import Estimate, Trajectory, estimate
@@ -24,11 +25,13 @@ _HOME = {
     "Estimate": "jaxsat.pipeline",
     "InputError": "jaxsat.errors",
     "MOTIONS": "jaxsat.studies.motions",
+    "Orientation": "jaxsat.attitude",
     "Recording": "jaxsat.signals.recording",
     "Sensor": "jaxsat.studies.simulate",
     "Trajectory": "jaxsat.pipeline",
     "estimate": "jaxsat.pipeline",
     "load_config": "jaxsat.config",
+    "orient": "jaxsat.attitude",
     "position_rmse": "jaxsat.studies.metrics",
     "read": "jaxsat.signals.readers",
     "simulate": "jaxsat.studies.simulate",
@@ -41,11 +44,13 @@ __all__ = [  # noqa: RUF022 (the order of _HOME)
     "Estimate",
     "InputError",
     "MOTIONS",
+    "Orientation",
     "Recording",
     "Sensor",
     "Trajectory",
     "estimate",
     "load_config",
+    "orient",
     "position_rmse",
     "read",
     "simulate",

@@ -4,7 +4,7 @@ import difflib
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -90,6 +90,31 @@ class Smoother(_Section):
     )
 
 
+class Orientation(_Section):
+    """`jaxsat orientation`: attitude alone, from gyroscope and accelerometer."""
+
+    estimate: Literal["gyro", "accel", "gyro_accel", "pi", "smoothed"] = "smoothed"
+    update: Literal["exact", "comp", "imp"] = "exact"
+    direction: Literal["mean", "unit"] = Field(
+        default="mean", description="what is called up: specific force over g, or its direction"
+    )
+    gains: Literal["given", "good_gain"] = Field(
+        default="given", description="kp and ki as given here, or as the Good Gain method proposes them"
+    )
+    # By gradient on the BROAD trials with breaks (results/orientation); ki half of the optimum: inclination is as
+    # good, and heading, which that loss does not see, better.
+    kp: float = Field(default=0.5, ge=0, description="proportional gain (1/s)")
+    ki: float = Field(default=0.005, ge=0, description="integral gain (1/s²)")
+    tau: float = Field(default=2.5, ge=0, description="low-pass on the specific force (s)")
+    gate: Literal["none"] | Annotated[float, Field(gt=0)] = Field(
+        default="none", description="how far |a| may be from g before it is not believed (m/s²)"
+    )
+    limit: float = Field(default=0.05, gt=0, description="largest rate that the integral term adds (rad/s)")
+    fill: Literal["interpolate", "none"] = Field(
+        default="interpolate", description="what becomes of saturated rates"
+    )
+
+
 class Config(_Section):
     """Everything that `estimate` can be told; unknown keys are errors."""
 
@@ -103,6 +128,7 @@ class Config(_Section):
     saturation: Saturation = Saturation()
     height: Height = Height()
     smoother: Smoother = Smoother()
+    orientation: Orientation = Orientation()
 
 
 def load_config(path: Path | None = None, **overrides: Any) -> Config:

@@ -13,6 +13,7 @@ ORDER = (
     "saturation",
     "config",
     "pipeline",
+    "attitude",
     "studies",
     "present",
     "demo",

@@ -11,7 +11,7 @@ from jaxsat.errors import InputError
 
 @app.command("simulate")
 def simulate_command(
-    motion: Annotated[str, typer.Argument(metavar="MOTION", help="bar, line, planar or walk")],
+    motion: Annotated[str, typer.Argument(metavar="MOTION", help="bar, joint, line, planar or walk")],
     out: Annotated[Path, typer.Option("--out", "-o", help="FILE.csv or FILE.parquet", metavar="FILE")],
     rate: Annotated[float, typer.Option(help="sampling rate", metavar="HZ")] = 100.0,
     duration: Annotated[

@@ -11,11 +11,12 @@ from typing import Any
 
 import pandas as pd
 
+from jaxsat.attitude import Orientation
 from jaxsat.errors import InputError
 from jaxsat.pipeline import Estimate
 from jaxsat.present.report import Track, render_report
-from jaxsat.present.summary import summarise
-from jaxsat.present.tables import gaps_table, signals_table, trajectory_table
+from jaxsat.present.summary import summarise, summarise_orientation
+from jaxsat.present.tables import gaps_table, orientation_table, signals_table, trajectory_table
 
 _TABLES = {"trajectory": trajectory_table, "signals": signals_table, "gaps": gaps_table}
 _KINDS = ("csv", "parquet")
@@ -23,6 +24,7 @@ _KINDS = ("csv", "parquet")
 ESTIMATE_FILES = frozenset(
     {"summary.json", "report.html", *(f"{name}.{kind}" for name in _TABLES for kind in _KINDS)}
 )
+ORIENTATION_FILES = frozenset({"summary.json", *(f"orientation.{kind}" for kind in _KINDS)})
 SWEEP_FILES = frozenset({"summary.json", *(f"sweep.{kind}" for kind in _KINDS)})
 
 
@@ -69,6 +71,20 @@ def write_results(
         _write_summary(summary, new)
         (new / "report.html").write_text(render_report(estimate, summary, beside or {}, scores), "utf-8")
     return folder / "report.html"
+
+
+def write_orientation(
+    found: Orientation, folder: str | Path, *, csv: bool = False, source: Path | None = None
+) -> Path:
+    """Write the table of an orientation and its summary; returns the path of the table.
+
+    A former folder of an orientation is replaced; raises `InputError` as `check_folder` does.
+    """
+    folder = Path(folder)
+    with _replaced(folder, ORIENTATION_FILES) as new:
+        name = _write_table(orientation_table(found), new, "orientation", csv).name
+        _write_summary(summarise_orientation(found, source), new)
+    return folder / name
 
 
 def write_sweep(

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pandas as pd
 
+from jaxsat.attitude import Orientation
 from jaxsat.config import Config
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
@@ -34,12 +35,7 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
     floor = estimate.floor
     return {
         "versions": _versions(),
-        "input": {
-            "name": estimate.recording.name,
-            "file": None if source is None else str(source),
-            "sha256": None if source is None else _hash(source),
-            **_extent(estimate.recording),
-        },
+        "input": _input(estimate.recording, source),
         "configuration": estimate.config.model_dump(mode="json"),
         "method": estimate.config.method,
         "rails": _rails(estimate.rails, estimate.gaps),
@@ -67,6 +63,24 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
     }
 
 
+def summarise_orientation(found: Orientation, source: Path | None = None) -> dict[str, Any]:
+    """Everything needed to judge and to repeat an orientation, ready for JSON (SI units)."""
+    gains = found.gains
+    used = {name: float(getattr(gains, name)) for name in ("kp", "ki", "tau", "gate", "limit")}
+    return {
+        "versions": _versions(),
+        "input": _input(found.recording, source),
+        "configuration": found.config.model_dump(mode="json"),
+        "estimate": found.config.orientation.estimate,
+        "gains": {name: value if np.isfinite(value) else "none" for name, value in used.items()},
+        "rails": _rails(found.rails, found.gaps),
+        "gravity": float(found.start.gravity),
+        "gyr_offset": found.start.offset.tolist(),
+        "bias_at_the_end": found.bias[-1].tolist(),
+        "warnings": found.warnings,
+    }
+
+
 def summarise_sweep(
     table: pd.DataFrame,
     config: Config,
@@ -91,6 +105,15 @@ def summarise_sweep(
         "rows": len(table),
         "status": {word: int(count) for word, count in table["status"].value_counts().sort_index().items()},
         "seconds": round(seconds, 3),
+    }
+
+
+def _input(recording: Recording, source: Path | None) -> dict[str, Any]:
+    return {
+        "name": recording.name,
+        "file": None if source is None else str(source),
+        "sha256": None if source is None else _hash(source),
+        **_extent(recording),
     }
 
 

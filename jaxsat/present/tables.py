@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from jaxsat.attitude import Orientation
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import CHANNELS
@@ -89,6 +90,22 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
         }
     )
     return table.sort_values(["start", "channel"], ignore_index=True)
+
+
+def orientation_table(found: Orientation) -> pd.DataFrame:
+    """One row a sample: the attitude at its start.
+
+    Columns: `time` (s), `q_w…q_z` (body to navigation frame), `euler_*` (rad, about x, y and z; Q_z ⊗ Q_y ⊗ Q_x),
+    `bias_*` (rad/s, the gyroscope's offset as known then), and `sat_*`, which channels saturate.
+    """
+    columns = {
+        ("time",): found.recording.time,
+        ("q_w", "q_x", "q_y", "q_z"): found.q_nb,
+        tuple(_axes("euler")): found.euler,
+        tuple(_axes("bias")): found.bias,
+        tuple(f"sat_{channel}" for channel in CHANNELS): found.sign != 0,
+    }
+    return _frame(columns)
 
 
 def _extreme(values: Float[np.ndarray, "n"]) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from jaxsat.attitude import Orientation
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
@@ -98,6 +99,27 @@ def estimate_text(estimate: Estimate, report: Path) -> str:
         ["misfit J*", cost],
         ["start to end", f"{moved:.3f} m horizontally, {position[-1, 2] - position[0, 2]:+.3f} m in height"],
         ["report", str(report)],
+    ]
+    return "\n".join(f"{label:<14}{text}" for label, text in rows)
+
+
+def orientation_text(found: Orientation, path: Path) -> str:
+    """What `jaxsat orientation` prints."""
+    recording, gains = found.recording, found.gains
+    first, last = np.rad2deg(found.euler[0]), np.rad2deg(found.euler[-1])
+    offset = np.rad2deg(found.start.offset)
+    rows = [
+        ["recording", f"{recording.name}, {len(recording)} samples at {1 / recording.period:.4g} Hz"],
+        ["estimate", found.config.orientation.estimate],
+        ["gains", f"kp {float(gains.kp):.4g} /s, ki {float(gains.ki):.4g} /s², tau {float(gains.tau):.4g} s"],
+        [
+            "saturated",
+            f"{plural(int((found.sign != 0).sum()), 'value')} in {plural(len(found.gaps), 'gap')}",
+        ],
+        ["offset", ", ".join(f"{x:+.3f}" for x in offset) + " deg/s"],
+        ["first", ", ".join(f"{x:+.2f}" for x in first) + " deg about x, y, z"],
+        ["last", ", ".join(f"{x:+.2f}" for x in last) + " deg; z drifts with the gyroscope"],
+        ["table", str(path)],
     ]
     return "\n".join(f"{label:<14}{text}" for label, text in rows)
 

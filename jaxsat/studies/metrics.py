@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -57,6 +57,39 @@ def last_position_error(
 ) -> float:
     """Distance between the last positions (m); unaligned as in Dang & Suh 2014, Table 1, unless asked."""
     return float(np.linalg.norm(_error(estimate, truth, axes, align)[-1]))
+
+
+class AttitudeErrors(NamedTuple):
+    """Root mean squares over time (rad)."""
+
+    total: float
+    heading: float
+    inclination: float
+
+
+def attitude_errors(
+    estimate: Float[np.ndarray, "N 4"],
+    truth: Float[np.ndarray, "N 4"],
+    scored: Bool[np.ndarray, "N"],
+    *,
+    align: bool = True,
+) -> AttitudeErrors:
+    """Errors of attitudes q_nb by the decomposition of the BROAD benchmark (Laidig et al., Data 2021, 6(7), 72).
+
+    Of the error quaternion in the navigation frame, q ⊗ q_true*, the total angle is 2 acos|w|, the heading
+    2 atan(z/w) and the inclination 2 acos√(w² + z²); scored: the samples that count. An estimate without a
+    magnetometer has a heading of its own, so its mean heading error is taken off first (`align`).
+    """
+    p, q = estimate[scored], truth[scored] * np.array([1.0, -1.0, -1.0, -1.0])
+    w = p[:, 0] * q[:, 0] - np.sum(p[:, 1:] * q[:, 1:], axis=1)
+    z = p[:, 0] * q[:, 3] + p[:, 3] * q[:, 0] + p[:, 1] * q[:, 2] - p[:, 2] * q[:, 1]
+    heading, tilted = 2.0 * np.arctan2(z, w), np.clip(np.hypot(w, z), 0.0, 1.0)
+    if align:
+        heading = heading - np.angle(np.mean(np.exp(1j * heading)))
+    heading = np.angle(np.exp(1j * heading))
+    total = 2.0 * np.arccos(np.clip(tilted * np.cos(0.5 * heading), 0.0, 1.0))
+    errors = (total, heading, 2.0 * np.arccos(tilted))
+    return AttitudeErrors(*(float(np.sqrt(np.mean(error**2))) for error in errors))
 
 
 def geometric_mean_ratio(values: Float[np.ndarray, "N"], baselines: Float[np.ndarray, "N"]) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsat.errors import InputError
-from jaxsat.inertial.rotations import quat_exp, quat_multiply
+from jaxsat.inertial.rotations import quat_exp, quat_multiply, quat_rotate
 
 
 def _ramp(x: Float[Array, ""]) -> Float[Array, ""]:
@@ -122,6 +122,40 @@ class Planar(_Single):
         return jnp.stack([self.length * progress, y, zero]), quat_exp(jnp.stack([zero, zero, heading]))
 
 
+class Joint(Motion):
+    """A joint bends about one axis, out to `angle`, over to minus `angle` and back, again and again.
+
+    The rates peak at 315/128 `angle`/`quarter`.
+    """
+
+    axis: Float[Array | np.ndarray, "3"] = eqx.field(
+        default_factory=lambda: np.array([1.0, 0.0, 0.0]), converter=np.asarray
+    )
+    """Unit vector, in the body."""
+    lever: Float[Array | np.ndarray, "3"] = eqx.field(
+        default_factory=lambda: np.full(3, 0.1), converter=np.asarray
+    )
+    """From the joint to the sensor (m)."""
+    angle: float = np.pi / 2
+    """rad"""
+    repetitions: int = 6
+    quarter: float = 1.15
+    """Time from the middle to either end (s)."""
+    start: float = 1.5
+
+    @property
+    def moving(self) -> Float[np.ndarray, "M 2"]:
+        return np.array([[self.start, self.start + 4.0 * self.quarter * self.repetitions]])
+
+    def pose(self, t: Float[Array, ""]) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
+        quarters = jnp.clip((t - self.start) / self.quarter, 0.0, 4.0 * self.repetitions)
+        phase = quarters - 4.0 * jnp.floor(quarters / 4.0)
+        bend = _ramp(phase) - 2.0 * _ramp((phase - 1.0) / 2.0) + _ramp(phase - 3.0)
+        q_nb = quat_exp(self.angle * bend * jnp.asarray(self.axis))
+        lever = jnp.asarray(self.lever)
+        return quat_rotate(q_nb, lever) - lever, q_nb
+
+
 class Walk(Motion):
     """A walking foot (x ahead, y left): strides over level ground, each a swing and then a stance at rest.
 
@@ -177,4 +211,4 @@ class Walk(Motion):
         return self.length * chord * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
 
 
-MOTIONS: dict[str, type[Motion]] = {"bar": Bar, "line": Line, "planar": Planar, "walk": Walk}
+MOTIONS: dict[str, type[Motion]] = {"bar": Bar, "joint": Joint, "line": Line, "planar": Planar, "walk": Walk}
