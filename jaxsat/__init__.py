@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxsat.config import Config, load_config
     from jaxsat.errors import InputError
+    from jaxsat.periodic import PeriodicEstimate, estimate_periodic
     from jaxsat.pipeline import Estimate, Trajectory, estimate
-    from jaxsat.present.folder import write_results
+    from jaxsat.present.folder import write_periodic, write_results
+    from jaxsat.saturation.harmonic_fill import fill_harmonic
     from jaxsat.signals.readers import read
     from jaxsat.signals.recording import Recording
     from jaxsat.studies.metrics import position_rmse
@@ -24,15 +26,19 @@ _HOME = {
     "Estimate": "jaxsat.pipeline",
     "InputError": "jaxsat.errors",
     "MOTIONS": "jaxsat.studies.motions",
+    "PeriodicEstimate": "jaxsat.periodic",
     "Recording": "jaxsat.signals.recording",
     "Sensor": "jaxsat.studies.simulate",
     "Trajectory": "jaxsat.pipeline",
     "estimate": "jaxsat.pipeline",
+    "estimate_periodic": "jaxsat.periodic",
+    "fill_harmonic": "jaxsat.saturation.harmonic_fill",
     "load_config": "jaxsat.config",
     "position_rmse": "jaxsat.studies.metrics",
     "read": "jaxsat.signals.readers",
     "simulate": "jaxsat.studies.simulate",
     "sweep": "jaxsat.studies.sweep",
+    "write_periodic": "jaxsat.present.folder",
     "write_results": "jaxsat.present.folder",
 }
 
@@ -41,15 +47,19 @@ __all__ = [  # noqa: RUF022 (the order of _HOME)
     "Estimate",
     "InputError",
     "MOTIONS",
+    "PeriodicEstimate",
     "Recording",
     "Sensor",
     "Trajectory",
     "estimate",
+    "estimate_periodic",
+    "fill_harmonic",
     "load_config",
     "position_rmse",
     "read",
     "simulate",
     "sweep",
+    "write_periodic",
     "write_results",
 ]
 

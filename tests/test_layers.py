@@ -13,6 +13,7 @@ ORDER = (
     "saturation",
     "config",
     "pipeline",
+    "periodic",
     "studies",
     "present",
     "demo",

@@ -72,10 +72,10 @@ def response(chain: Sequence[Filter], frequency: Float[Array, "*F"]) -> Complex[
 
     frequency: Hz. Its modulus is the gain, its argument the phase that a sinusoid takes on.
     """
-    jw = 2j * jnp.pi * frequency
+    jw = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
     total = jnp.ones_like(jw)
     for stage in chain:
-        x = jw if stage.period is None else jnp.exp(-jw * stage.period)
+        x = jw if stage.period is None else jnp.exp(-jw * jnp.asarray(stage.period, jw.dtype))
         powers = jnp.stack([jnp.ones_like(x), x, x * x])
         top = jnp.tensordot(jnp.asarray(stage.numerator, jw.dtype), powers, 1)
         bottom = jnp.tensordot(jnp.asarray(stage.denominator, jw.dtype), powers, 1)

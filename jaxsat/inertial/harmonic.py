@@ -49,12 +49,12 @@ def least_squares(
     Eq. 3.53-3.54). Solved in w/√λ, so that λ = 0 leaves a weight out and tiny ones do no harm.
     """
     root = jnp.sqrt(spectrum.prior)
-    scaled = x * root
+    scaled = x * root[None, :]
     hessian = jnp.eye(x.shape[1], dtype=x.dtype) + scaled.T @ (scaled * weight[:, None]) / spectrum.noise
     factor = cho_factor(hessian, lower=True)
     weights = cho_solve(factor, scaled.T @ (weight * signal)) / spectrum.noise
     covariance = cho_solve(factor, jnp.eye(x.shape[1], dtype=x.dtype))
-    return Fit(root * weights, root[:, None] * covariance * root)
+    return Fit(root * weights, root[:, None] * covariance * root[None, :])
 
 
 def predict(fit: Fit, z: Float[Array, "N W"]) -> tuple[Float[Array, "N"], Float[Array, "N"]]:
@@ -83,8 +83,8 @@ def recursive(
         P = P + jnp.diag(drift)
         gain = m * (P @ reference) / (reference @ P @ reference + spectrum.noise)
         # Joseph's form keeps the covariance positive.
-        A = identity - gain[:, None] * reference
-        P = A @ P @ A.T + spectrum.noise * gain[:, None] * gain
+        A = identity - gain[:, None] * reference[None, :]
+        P = A @ P @ A.T + spectrum.noise * gain[:, None] * gain[None, :]
         w = w + gain * (s - reference @ w)
         return (w, P), (output @ w, output @ P @ output)
 

@@ -64,7 +64,8 @@ def chain_response(
 
     order: 2 for position by an accelerometer, 1 for an angle by a gyroscope; integrators are filters of the chain.
     """
-    return (2j * jnp.pi * frequency) ** order * response(chain, frequency)
+    jw = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
+    return jw**order * response(chain, frequency)
 
 
 def compensated(
@@ -74,7 +75,7 @@ def compensated(
 
     sin(θ − arg G)/|G| and cos(θ − arg G)/|G|. With G = 1 it is the plain reference input x.
     """
-    size, angle = jnp.abs(gain), jnp.angle(gain)
+    size, angle = (jnp.broadcast_to(part, phase.shape) for part in (jnp.abs(gain), jnp.angle(gain)))
     return jnp.concatenate([jnp.sin(phase - angle) / size, jnp.cos(phase - angle) / size], axis=-1)
 
 

@@ -33,16 +33,16 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
     words = [Status(code).name.lower() for code in fills.status[busy]]
     floor = estimate.floor
     return {
-        "versions": _versions(),
+        "versions": versions(),
         "input": {
             "name": estimate.recording.name,
             "file": None if source is None else str(source),
-            "sha256": None if source is None else _hash(source),
-            **_extent(estimate.recording),
+            "sha256": None if source is None else file_hash(source),
+            **extent(estimate.recording),
         },
         "configuration": estimate.config.model_dump(mode="json"),
         "method": estimate.config.method,
-        "rails": _rails(estimate.rails, estimate.gaps),
+        "rails": rails_summary(estimate.rails, estimate.gaps),
         "rests": _rests(estimate.recording, estimate.rest),
         "segments": {
             "count": len(estimate.segments),
@@ -79,8 +79,8 @@ def summarise_sweep(
     swept: the values of each parameter; sources: the files of the trials, whose SHA-256 is stored.
     """
     return {
-        "versions": _versions(),
-        "inputs": [{"file": str(path), "sha256": _hash(path)} for path in sources],
+        "versions": versions(),
+        "inputs": [{"file": str(path), "sha256": file_hash(path)} for path in sources],
         "configuration": config.model_dump(mode="json"),
         "swept": {
             name: [
@@ -94,7 +94,7 @@ def summarise_sweep(
     }
 
 
-def _hash(path: Path) -> str | None:
+def file_hash(path: Path) -> str | None:
     """SHA-256 of a file; None where it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -158,20 +158,20 @@ def inspect(recording: Recording, config: Config) -> dict[str, Any]:
     )
     return {
         "name": recording.name,
-        **_extent(recording),
+        **extent(recording),
         "specific_force_at_rest": float(np.linalg.norm(recording.acc[rest], axis=1).mean())
         if rest.any()
         else None,
         "lowest": dict(zip(CHANNELS, recording.signal.min(axis=0).tolist(), strict=True)),
         "highest": dict(zip(CHANNELS, recording.signal.max(axis=0).tolist(), strict=True)),
         "saturated": dict(zip(CHANNELS, saturated.sum(axis=0).tolist(), strict=True)),
-        "rails": _rails(rails, find_gaps(sign)),
+        "rails": rails_summary(rails, find_gaps(sign)),
         "rests": _rests(recording, rest),
         "warnings": warnings,
     }
 
 
-def _extent(recording: Recording) -> dict[str, Any]:
+def extent(recording: Recording) -> dict[str, Any]:
     return {
         "samples": len(recording),
         "rate": round(1 / recording.period, 6),
@@ -180,7 +180,7 @@ def _extent(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _rails(rails: Rails, gaps: Gaps) -> dict[str, Any]:
+def rails_summary(rails: Rails, gaps: Gaps) -> dict[str, Any]:
     """Per channel and side: the limit (null: none), how many samples lie there, and in how many gaps."""
     table = {}
     for j, channel in enumerate(CHANNELS):
@@ -210,7 +210,7 @@ def _rests(recording: Recording, rest: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     names = ("jaxsat", "jax", "jaxlib", "jaxopt", "equinox", "numpy", "scipy")
     device = jax.devices()[0]
     return {

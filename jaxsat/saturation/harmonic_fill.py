@@ -110,7 +110,7 @@ def _propagate(
         root = jnp.sqrt(spectrum.prior * scale)
         precision = jnp.where(there, 1 / spectrum.noise, precision)
         shift = jnp.where(there, y / spectrum.noise, shift)
-        scaled = x * root
+        scaled = x * root[None, :]
         hessian = jnp.eye(x.shape[1], dtype=x.dtype) + scaled.T @ (scaled * precision[:, None])
         factor = jnp.linalg.cholesky(hessian)
         inverse = solve_triangular(factor, jnp.eye(x.shape[1], dtype=x.dtype), lower=True)
@@ -143,7 +143,7 @@ def _propagate(
             jnp.where(sign == 0, 0.0, (1 - DAMPING) * sites.precision + DAMPING * precision),
             jnp.where(sign == 0, 0.0, (1 - DAMPING) * sites.shift + DAMPING * shift),
         )
-        scale = jnp.mean(power / jnp.maximum(spectrum.prior, 1e-300), axis=1)
+        scale = jnp.mean(power / jnp.maximum(spectrum.prior, 1e-300)[None, :], axis=1)
         scale = jnp.clip(scale / jnp.exp(jnp.mean(jnp.log(scale))), 1e-3, 1e3)
         prior = group @ jnp.mean(power / scale[:, None], axis=0)
         # A signal without noise would make the Hessian singular: 1e-10 of its variance is far below any sensor's.
