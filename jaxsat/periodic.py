@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.signal import welch
 
 from jaxsat.config import Config
 from jaxsat.errors import InputError
@@ -95,7 +96,10 @@ def _estimate(recording: Recording, config: Config) -> PeriodicEstimate:
         signal = filled[:, columns]
         if sensor == "acc" and "gyr" in bands:
             signal = signal + np.cross(motion[:, :3], offset[1])
-        certainty = _certainty(recording, signal_sd, columns, signal)
+        noise = np.array([_noise_variance(axis, recording.period, high) for axis in signal.T])
+        # Weight of each value beside a measured one: 0 where missing, less where filled.
+        certainty = noise / (noise + signal_sd[:, columns] ** 2)
+        certainty = np.where(recording.missing[:, columns], 0.0, certainty)
         motion[:, columns], spread = _fit(signal, certainty, recording, config, ORDER[sensor], low, high)
         if spread is None or sd is None:
             sd = None
@@ -108,7 +112,9 @@ def _estimate(recording: Recording, config: Config) -> PeriodicEstimate:
             "along them is a rough one."
         )
     if "gyr" not in bands and "acc" in bands:
-        warnings.append("there is no angle from a gyroscope: gravity that tilting moves is seen as acceleration.")
+        warnings.append(
+            "there is no angle from a gyroscope: gravity that tilting moves is seen as acceleration."
+        )
     found = (recording, config, bands, motion, sd, rails, find_gaps(sign), sign, filled, signal_sd)
     return PeriodicEstimate(*found, warnings, round(time.perf_counter() - started, 3))
 
@@ -129,7 +135,9 @@ def _bands(recording: Recording, config: Config, there: dict[str, bool]) -> dict
     if given != "auto":
         low, high = given
         if not 0 < low < high:
-            raise InputError(f"the band {low:g} to {high:g} Hz is none; give two frequencies, 0 < LOW < HIGH.")
+            raise InputError(
+                f"the band {low:g} to {high:g} Hz is none; give two frequencies, 0 < LOW < HIGH."
+            )
         if high >= nyquist:
             raise InputError(
                 f"{name}: the band ends at {high:g} Hz, but the recording holds nothing from {nyquist:g} Hz on, "
@@ -169,18 +177,21 @@ def _fill(
     return filled, sd
 
 
-def _certainty(recording: Recording, sd: np.ndarray, columns: slice, signal: np.ndarray) -> np.ndarray:
-    """Weight of each value beside a measured one: 0 where missing, less where filled.
-
-    Noise is not known yet; second differences of the signal bound it (their sd is √6 of it).
-    """
-    noise = np.maximum(np.median(np.abs(np.diff(signal, 2, axis=0)), axis=0) / (0.6745 * np.sqrt(6)), 1e-12)
-    weight = 1 / (1 + (sd[:, columns] / noise) ** 2)
-    return np.where(recording.missing[:, columns], 0.0, weight)
+def _noise_variance(x: np.ndarray, period: float, high: float) -> float:
+    """Variance of white noise as strong as what lies an octave and more above the band, or near the top."""
+    frequency, power = welch(x, 1 / period, nperseg=min(256, len(x)))
+    above = power[frequency >= min(2 * high, 0.4 / period)]
+    return max(float(np.median(above)) * 0.5 / period, 1e-8 * float(x.var()), 1e-300)
 
 
 def _fit(
-    signal: np.ndarray, weight: np.ndarray, recording: Recording, config: Config, order: int, low: float, high: float
+    signal: np.ndarray,
+    weight: np.ndarray,
+    recording: Recording,
+    config: Config,
+    order: int,
+    low: float,
+    high: float,
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Motion of the three axes of a sensor, and its sd."""
     settings, period = config.periodic, recording.period
@@ -220,10 +231,7 @@ def _combine(signal, time, frequency, order, highpass, sensor, mu, mu_frequency,
     # One harmonic: a band of less than an octave holds no second.
     scale = jnp.maximum(jnp.sqrt(2 * jnp.median(filtered**2)), 1e-30)
     start = (frequency[0] + frequency[-1]) / 2
-    return (
-        scale
-        * wflc(filtered / scale, period, start, 1, (*chain, *sensor), order, mu, mu_frequency).motion
-    )
+    return scale * wflc(filtered / scale, period, start, 1, (*chain, *sensor), order, mu, mu_frequency).motion
 
 
 def _in_windows(
@@ -238,7 +246,7 @@ def _in_windows(
     frequency = spacing * np.arange(1, int(top / spacing) + 1)
     inside = (frequency >= low - spacing / 2) & (frequency <= high + spacing / 2)
     x, z = _references(
-        jnp.asarray(frequency), jnp.asarray(inside), jnp.arange(length) * period, order, sensor
+        jnp.asarray(frequency), jnp.asarray(inside), jnp.asarray(np.arange(length) * period), order, sensor
     )
     group = jnp.asarray(neighbours(len(frequency), 2))
     few = np.unique(np.linspace(0, len(windows.start) - 1, LEARNING_WINDOWS).astype(int))
@@ -250,7 +258,9 @@ def _in_windows(
         rows, weights = windows.of((s - offset) / scale), windows.of(m)
         power = periodogram(rows, frequency * period)
         start = Spectrum(jnp.asarray(np.concatenate([power, power, [1.0]])), jnp.asarray(0.01))
-        mean, variance = _windowed(jnp.asarray(rows), jnp.asarray(weights), jnp.asarray(few), x, z, group, start)
+        mean, variance = _windowed(
+            jnp.asarray(rows), jnp.asarray(weights), jnp.asarray(few), x, z, group, start
+        )
         motion[:, axis] = scale * windows.joined(np.asarray(mean))
         sd[:, axis] = scale * windows.joined(np.sqrt(np.asarray(variance)))
     return motion, sd
@@ -289,14 +299,14 @@ def _recursive(
     below = np.arange(low - spacing, spacing / 2, -spacing)[::-1]
     frequency = np.concatenate([below, np.linspace(low, high, count)])
     inside = frequency >= low - 1e-9
-    time = jnp.arange(len(signal)) * period
+    time = jnp.asarray(np.arange(len(signal)) * period)
     x, z = _references(jnp.asarray(frequency), jnp.asarray(inside), time, order, sensor)
     motion, sd = np.zeros_like(signal), np.zeros_like(signal)
     for axis, (s, m) in enumerate(zip(signal.T, weight.T, strict=True)):
         if not m.any() or np.ptp(s) == 0:
             continue
         centred = (s - s[0]) / s.std()
-        noise = max(np.median(np.abs(np.diff(centred, 2))) / (0.6745 * np.sqrt(6)), 1e-4) ** 2
+        noise = _noise_variance(centred, period, high)
         # The power of the whole recording around each frequency; a constant of any size.
         length = min(len(s), round(1 / (spacing * period)))
         power = periodogram(Windows.cut(len(s), length).of(centred), frequency * period)
@@ -307,7 +317,9 @@ def _recursive(
         spectrum = Spectrum(jnp.asarray(prior), jnp.asarray(noise))
         tracked = _track(jnp.asarray(centred), jnp.asarray(m), x, z, spectrum, jnp.asarray(drift))
         motion[:, axis] = s.std() * np.asarray(tracked.motion)
-        sd[:, axis] = s.std() * np.sqrt(np.maximum(np.asarray(tracked.variance), 0.0))
+        # All variances by one factor leave the estimate as it is, and fit the errors of prediction.
+        calibration = float(jnp.sum(tracked.surprise)) / max((m > 0).sum(), 1)
+        sd[:, axis] = s.std() * np.sqrt(np.maximum(calibration * np.asarray(tracked.variance), 0.0))
     return motion, sd
 
 

@@ -29,9 +29,7 @@ def periodic_command(
     out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
     method: Annotated[
         str | None,
-        typer.Option(
-            help="least_squares, recursive, bmflc or wflc (default: least_squares)", metavar="NAME"
-        ),
+        typer.Option(help="least_squares, recursive, bmflc or wflc (default: least_squares)", metavar="NAME"),
     ] = None,
     band: Annotated[
         tuple[float, float] | None,

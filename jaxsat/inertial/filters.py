@@ -54,7 +54,7 @@ def _analogue(zeros: np.ndarray, poles: np.ndarray, gain: float) -> Filter:
     for i in range(0, len(poles), 2):
         pair = poles[i : i + 2]
         mine, zeros = zeros[: len(pair)], zeros[len(pair) :]
-        rows.append([np.real(np.poly(mine))[::-1], np.real(np.poly(pair))[::-1]])
+        rows.append([np.real(np.atleast_1d(np.poly(roots)))[::-1] for roots in (mine, pair)])
     padded = np.array([[np.pad(part, (0, 3 - len(part))) for part in row] for row in rows])
     padded[0, 0] *= gain
     return Filter(padded[:, 0], padded[:, 1])

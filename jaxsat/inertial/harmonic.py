@@ -24,6 +24,9 @@ class Tracked(eqx.Module):
 
     motion: Float[Array, "N"]
     variance: Float[Array, "N"]
+    surprise: Float[Array, "N"]
+    """Squared error of each sample's prediction over its variance: 1 on average if the variances are right, 0 where
+    nothing was measured."""
     fit: Fit
     """After the last sample."""
 
@@ -81,16 +84,18 @@ def recursive(
         w, P = carry
         s, m, reference, output = row
         P = P + jnp.diag(drift)
-        gain = m * (P @ reference) / (reference @ P @ reference + spectrum.noise)
+        expected = reference @ P @ reference + spectrum.noise
+        error = s - reference @ w
+        gain = m * (P @ reference) / expected
         # Joseph's form keeps the covariance positive.
         A = identity - gain[:, None] * reference[None, :]
         P = A @ P @ A.T + spectrum.noise * gain[:, None] * gain[None, :]
-        w = w + gain * (s - reference @ w)
-        return (w, P), (output @ w, output @ P @ output)
+        w = w + gain * error
+        return (w, P), (output @ w, output @ P @ output, m * error**2 / expected)
 
     first = (jnp.zeros(x.shape[1], x.dtype), jnp.diag(spectrum.prior))
-    (w, P), (motion, variance) = jax.lax.scan(step, first, (signal, weight, x, z))
-    return Tracked(motion, variance, Fit(w, P))
+    (w, P), (motion, variance, surprise) = jax.lax.scan(step, first, (signal, weight, x, z))
+    return Tracked(motion, variance, surprise, Fit(w, P))
 
 
 def learn(

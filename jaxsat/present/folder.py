@@ -14,7 +14,12 @@ import pandas as pd
 from jaxsat.errors import InputError
 from jaxsat.periodic import PeriodicEstimate
 from jaxsat.pipeline import Estimate
-from jaxsat.present.periodic import motion_table, periodic_gaps_table, periodic_signals_table, summarise_periodic
+from jaxsat.present.periodic import (
+    motion_table,
+    periodic_gaps_table,
+    periodic_signals_table,
+    summarise_periodic,
+)
 from jaxsat.present.report import Track, render_report
 from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table, signals_table, trajectory_table

@@ -147,7 +147,7 @@ def _propagate(
         scale = jnp.clip(scale / jnp.exp(jnp.mean(jnp.log(scale))), 1e-3, 1e3)
         prior = group @ jnp.mean(power / scale[:, None], axis=0)
         # A signal without noise would make the Hessian singular: 1e-10 of its variance is far below any sensor's.
-        noise = jnp.maximum(jnp.sum(rest) / jnp.sum(measured), 1e-10)
+        noise = jnp.maximum(jnp.sum(rest) / jnp.sum(measured.astype(y.dtype)), 1e-10)
         return Spectrum(prior, noise), scale, sites, reading, variance
 
     nothing = _Sites(jnp.zeros_like(y), jnp.zeros_like(y))
