@@ -1,6 +1,6 @@
 """Periodic motion: the simulation of Latt et al. 2011, and real recordings that were clipped in software.
 
-    python scripts/periodic_tables.py [simulation] [tremor] [arm] [reference] [board] [-o results/periodic] [--data DIR]
+    python scripts/periodic_tables.py [simulation] [arm] [reference] [tremor] [board] [-o DIR] [--data DIR]
 
 Each part writes a table (CSV) and figures; `board` makes board.json, board.md and env.json of the tables. Without
 a name, all of them run, in this order.
@@ -35,7 +35,7 @@ from jaxsat.studies.boards import Row, write_board
 from jaxsat.studies.metrics import load_broad_truth
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "configs" / "periodic"
@@ -301,7 +301,8 @@ def board(out: Path) -> None:
         key = (motion, rate, filtered)
         lms = table.loc[(*key, mu, "modified BMFLC")]
         for k, (statistic, label) in enumerate((("rms", "RMS"), ("max", "maximum"))):
-            note = f"{label} error of the modified BMFLC, μ = {mu:g}, median of {config['seeds']} seeds; goal: the paper"
+            seeds = config["seeds"]
+            note = f"{label} error of the modified BMFLC, μ = {mu:g}, median of {seeds} seeds; goal: the paper"
             rows.append(Row(f"{where}_bmflc_{statistic}", lms[statistic], unit, "lower", ours[k], note=note))
             late = table.loc[(*key, config["paper_mu"], "analytical, one sample late")][statistic]
             aligned = table.loc[(*key, mu, "analytical")][statistic]
@@ -323,7 +324,8 @@ def board(out: Path) -> None:
             ratio = float(np.exp(np.log(part["ratio"]).mean()))
             note = (
                 f"{label}: error in the gaps over a cubic spline's, geometric mean of {len(part)} channels "
-                f"({part['ratio'].min():.2f} to {part['ratio'].max():.2f}); 95 % bands hold {part['cover95'].mean():.0%}"
+                f"({part['ratio'].min():.2f} to {part['ratio'].max():.2f}); 95 % bands hold "
+                f"{part['cover95'].mean():.0%}"
             )
             rows.append(Row(f"{name}_fill_ratio_{share:g}", ratio, "1", "lower", 1 / 3, note=note))
     for _, row in pd.read_csv(out / "reference.csv").iterrows():

@@ -37,7 +37,7 @@ def periodic_signals_table(found: PeriodicEstimate) -> pd.DataFrame:
 
 
 def periodic_gaps_table(found: PeriodicEstimate) -> pd.DataFrame:
-    """One row a gap: `channel`, `start` and `end` (s, [start, end)), `rail` (signed), `peak` of the fill, `peak_sd`."""
+    """One row a gap: `channel`, `start`, `end` (s, [start, end)), `rail` (signed), `peak` of the fill, `peak_sd`."""
     gaps, recording = found.gaps, found.recording
     rows = []
     for channel, sign, start, end in zip(gaps.channel, gaps.sign, gaps.start, gaps.end, strict=True):
