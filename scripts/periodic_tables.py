@@ -30,7 +30,8 @@ from jaxsat.inertial.periodic import analytical, band, chain_response, compensat
 from jaxsat.periodic import estimate_periodic
 from jaxsat.saturation.harmonic_fill import fill_harmonic
 from jaxsat.signals.readers import read
-from jaxsat.signals.support import find_support
+from jaxsat.signals.recording import Recording
+from jaxsat.signals.support import find_band, find_support
 from jaxsat.studies.boards import Row, write_board
 from jaxsat.studies.metrics import load_broad_truth
 
@@ -240,24 +241,34 @@ def arm(out: Path, data: Path) -> None:
 
 def reference(out: Path, data: Path) -> None:
     """A hand-held board moved to and fro, against optical tracking (BROAD): position in the band, body axes."""
-    rows = []
+    config, rows = settings("tremor"), []
     for path in sorted((data / "broad").glob("*translation*.npz")):
         recording = read(path)
-        found = estimate_periodic(recording, load_config(None, **{"rails.gyr": "none", "rails.acc": "none"}))
-        if "acc" not in found.band:
+        first, count = (round(config[f"reference_{key}"] / recording.period) for key in ("start", "seconds"))
+        part = slice(first, first + count)
+        recording = Recording(
+            recording.time[part],
+            recording.gyr[part],
+            recording.acc[part],
+            recording.missing[part],
+            name=path.stem,
+        )
+        if find_band(recording.acc, recording.period) is None:
+            print(path.stem, "has no band in this stretch", flush=True)
             continue
+        settled = {"rails.gyr": "none", "rails.acc": "none"}  # none of them saturates
+        found = estimate_periodic(recording, load_config(None, **settled))
         low, high = found.band["acc"]
-        time, q_nb, position, valid = load_broad_truth(path)
-        index = np.arange(len(time))
+        _, q_nb, position, valid = (x[part] for x in load_broad_truth(path))
+        index = np.arange(len(q_nb))
         position = np.stack([np.interp(index, index[valid], axis[valid]) for axis in position.T], axis=1)
         sections = signal.butter(4, [low, high], "bandpass", fs=1 / recording.period, output="sos")
         turn = Rotation.from_quat(q_nb, scalar_first=True)
-        true = turn.inv().apply(signal.sosfiltfilt(sections, position, axis=0))[: len(recording)]
+        true = turn.inv().apply(signal.sosfiltfilt(sections, position, axis=0))
         # Both through the same band, so that what the reference leaves out is not counted.
         seen = signal.sosfiltfilt(sections, found.motion[:, 3:], axis=0)
-        moving = valid[: len(recording)] & (
-            np.linalg.norm(true, axis=1) > 0.1 * np.linalg.norm(true, axis=1).max()
-        )
+        size = np.linalg.norm(true, axis=1)
+        moving = valid & (size > 0.1 * size.max())
         error = np.sqrt(np.mean(np.sum((seen - true)[moving] ** 2, axis=1)))
         size = np.sqrt(np.mean(np.sum(true[moving] ** 2, axis=1)))
         angle = float(np.sqrt(np.mean(np.sum(found.motion[:, :3] ** 2, axis=1))))
@@ -302,7 +313,9 @@ def board(out: Path) -> None:
         lms = table.loc[(*key, mu, "modified BMFLC")]
         for k, (statistic, label) in enumerate((("rms", "RMS"), ("max", "maximum"))):
             seeds = config["seeds"]
-            note = f"{label} error of the modified BMFLC, μ = {mu:g}, median of {seeds} seeds; goal: the paper"
+            note = (
+                f"{label} error of the modified BMFLC, μ = {mu:g}, median of {seeds} seeds; goal: the paper"
+            )
             rows.append(Row(f"{where}_bmflc_{statistic}", lms[statistic], unit, "lower", ours[k], note=note))
             late = table.loc[(*key, config["paper_mu"], "analytical, one sample late")][statistic]
             aligned = table.loc[(*key, mu, "analytical")][statistic]
