@@ -84,6 +84,8 @@ def _estimate(recording: Recording, config: Config) -> PeriodicEstimate:
         raise InputError(f"{recording.name}: more than half of both sensors is missing; record again.")
     warnings = _unit_warnings(recording, there)
     bands = _bands(recording, config, there)
+    for low, _ in bands.values():
+        _filters(config, recording.period, low)  # what does not fit is said before anything is computed
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
     _, sign = saturation_mask(recording, rails)
     sign[:, np.repeat([not there["gyr"], not there["acc"]], 3)] = 0
@@ -177,6 +179,22 @@ def _fill(
     return filled, sd
 
 
+def _filters(config: Config, period: float, low: float) -> tuple[tuple[Filter, ...], Filter]:
+    """The sensor's own filter, if there is one, and the high-pass of the paper's combiners."""
+    settings = config.periodic
+    sensor: tuple[Filter, ...] = ()
+    if settings.sensor_lowpass != "none":
+        sensor = (butterworth("lowpass", 1, settings.sensor_lowpass, None),)
+    cutoff = low / 2 if settings.highpass == "auto" else settings.highpass
+    highpass = butterworth("highpass", settings.highpass_order, cutoff, 1 / period)
+    if settings.method == "bmflc" and settings.mu * settings.frequencies >= 1:
+        raise InputError(
+            f"periodic.mu = {settings.mu:g} with {settings.frequencies} frequencies does not converge; "
+            "lower either until their product is below 1."
+        )
+    return sensor, highpass
+
+
 def _noise_variance(x: np.ndarray, period: float, high: float) -> float:
     """Variance of white noise as strong as what lies an octave and more above the band, or near the top."""
     frequency, power = welch(x, 1 / period, nperseg=min(256, len(x)))
@@ -195,20 +213,11 @@ def _fit(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Motion of the three axes of a sensor, and its sd."""
     settings, period = config.periodic, recording.period
-    sensor: tuple[Filter, ...] = ()
-    if settings.sensor_lowpass != "none":
-        sensor = (butterworth("lowpass", 1, settings.sensor_lowpass, None),)
+    sensor, highpass = _filters(config, period, low)
     if settings.method == "least_squares":
         return _in_windows(signal, weight, period, order, sensor, low, high)
     if settings.method == "recursive":
         return _recursive(signal, weight, period, order, sensor, low, high, settings.frequencies)
-    cutoff = low / 2 if settings.highpass == "auto" else settings.highpass
-    highpass = butterworth("highpass", settings.highpass_order, cutoff, 1 / period)
-    if settings.method == "bmflc" and settings.mu * settings.frequencies >= 1:
-        raise InputError(
-            f"periodic.mu = {settings.mu:g} with {settings.frequencies} frequencies does not converge; "
-            "lower either until their product is below 1."
-        )
     frequency = jnp.linspace(low, high, settings.frequencies)
     centred = jnp.asarray(signal - signal[:1])
     run = partial(

@@ -1,6 +1,6 @@
 """Periodic motion: the simulation of Latt et al. 2011, and real recordings that were clipped in software.
 
-    python scripts/periodic_tables.py [simulation] [arm] [reference] [tremor] [board] [-o DIR] [--data DIR]
+    python scripts/periodic_tables.py [simulation] [clip] [arm] [reference] [tremor] [board] [-o DIR] [--data DIR]
 
 Each part writes a table (CSV) and figures; `board` makes board.json, board.md and env.json of the tables. Without
 a name, all of them run, in this order.
@@ -278,6 +278,20 @@ def reference(out: Path, data: Path) -> None:
     pd.DataFrame(rows).to_csv(out / "reference.csv", index=False, float_format="%.4g")
 
 
+def periodic_clip(out: Path) -> None:
+    """The simulated acceleration, clipped and filled: a signal that is periodic indeed."""
+    config, clips = settings("simulation"), settings("tremor")
+    rate = config["rates"][0]
+    time = np.arange(round(config["duration"] * rate)) / rate
+    noise = config["noise"] * np.random.default_rng(2011).normal(size=len(time))
+    true = config["amplitude"] * np.sin(2 * np.pi * np.outer(time, config["frequencies"])).sum(axis=1) + noise
+    rows = [
+        {"recording": "simulated", "channel": "acc", **clipped_and_filled(true, share)}
+        for share in clips["shares"]
+    ]
+    pd.DataFrame(rows).to_csv(out / "clip.csv", index=False, float_format="%.4g")
+
+
 def tremor(out: Path, data: Path) -> None:
     config = settings("tremor")
     # Takes minutes: a table that is there already is continued.
@@ -331,7 +345,12 @@ def board(out: Path) -> None:
             note = f"RMS error over that of the modified BMFLC on the same data; {value:.3g} {unit}"
             metric = f"{where}_{name.replace(' ', '_')}_ratio"
             rows.append(Row(metric, value / lms["rms"], "1", "lower", 0.5, note=note))
-    for name, label in (("tremor", "hand tremor"), ("arm", "rates of the robot arm, which has no period")):
+    labels = (
+        ("clip", "the simulated acceleration"),
+        ("tremor", "hand tremor"),
+        ("arm", "rates of the robot arm, which has no period"),
+    )
+    for name, label in labels:
         gaps = pd.read_csv(out / f"{name}.csv")
         for share, part in gaps.groupby("share"):
             ratio = float(np.exp(np.log(part["ratio"]).mean()))
@@ -359,12 +378,14 @@ def main() -> None:
     out = arguments.output
     out.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
-    parts = arguments.parts or ["simulation", "arm", "reference", "tremor", "board"]
+    parts = arguments.parts or ["simulation", "clip", "arm", "reference", "tremor", "board"]
     if "simulation" in parts:
         simulation(out)
     for name, part in (("arm", arm), ("reference", reference), ("tremor", tremor)):
         if name in parts:
             part(out, arguments.data)
+    if "clip" in parts:
+        periodic_clip(out)
     if "board" in parts:
         board(out)
 

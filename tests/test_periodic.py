@@ -236,7 +236,7 @@ def test_bands_cover_what_they_say(key):
     group = jnp.asarray(neighbours(len(frequency), 2))
     ones = jnp.ones(s.shape)
     spectrum = jax.jit(learn, static_argnums=5)(jnp.asarray(s), ones, jnp.asarray(x), group, start, 20)
-    assert float(spectrum.noise) == pytest.approx(0.49, rel=0.1)
+    assert float(spectrum.noise) == pytest.approx(0.49, rel=0.2)
 
     @jax.jit
     def band_of(row):
