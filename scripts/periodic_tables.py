@@ -351,6 +351,8 @@ def board(out: Path) -> None:
         ("arm", "rates of the robot arm, which has no period"),
     )
     for name, label in labels:
+        if not (out / f"{name}.csv").exists():
+            continue
         gaps = pd.read_csv(out / f"{name}.csv")
         for share, part in gaps.groupby("share"):
             ratio = float(np.exp(np.log(part["ratio"]).mean()))
