@@ -294,7 +294,7 @@ def _windowed(rows, weights, few, x, z, group, start):
     spectrum = learn(rows[few], weights[few], x, group, start, LEARNING_ITERATIONS)
 
     def one(row):
-        return predict(least_squares(*row, x, spectrum), z)
+        return predict(least_squares(row[0], row[1], x, spectrum), z)
 
     return jax.lax.map(one, (rows, weights))
 

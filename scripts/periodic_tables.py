@@ -362,7 +362,7 @@ def board(out: Path) -> None:
                 f"{part['cover95'].mean():.0%}"
             )
             rows.append(Row(f"{name}_fill_ratio_{share:g}", ratio, "1", "lower", 1 / 3, note=note))
-    for _, row in pd.read_csv(out / "reference.csv").iterrows():
+    for row in pd.read_csv(out / "reference.csv").to_dict("records"):
         note = (
             f"{row['rmse_mm']:.3g} of {row['rms_mm']:.3g} mm in {row['low']:.2f} to {row['high']:.2f} Hz, against "
             f"optical tracking; angle {row['angle_rms']:.2g} rad RMS"

@@ -1,6 +1,7 @@
 """Linear filters with a known frequency response: what stands between a motion and the signal that is fitted."""
 
 from collections.abc import Sequence
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -35,26 +36,25 @@ def butterworth(kind: str, order: int, cutoff: float, rate: float | None) -> Fil
     if not (np.isfinite(cutoff) and cutoff > 0):
         raise InputError(f"the {kind} filter's cut-off is {cutoff} Hz; give a positive frequency.")
     if rate is None:
-        z, p, k = signal.butter(order, 2 * np.pi * cutoff, kind, analog=True, output="zpk")
-        return _analogue(z, p, k)
+        return _analogue(
+            *cast(Any, signal.butter(order, 2 * np.pi * cutoff, kind, analog=True, output="zpk"))
+        )
     if cutoff >= rate / 2:
         raise InputError(
             f"the {kind} filter's cut-off of {cutoff:g} Hz is not below {rate / 2:g} Hz, half of the sampling "
             "rate; lower it, or check the rate."
         )
-    sections = signal.butter(order, cutoff, kind, fs=rate, output="sos")
+    sections = np.asarray(signal.butter(order, cutoff, kind, fs=rate, output="sos"))
     return Filter(sections[:, :3], sections[:, 3:], 1.0 / rate)
 
 
 def _analogue(zeros: np.ndarray, poles: np.ndarray, gain: float) -> Filter:
     """Sections of ascending powers of s from zeros, poles and gain; conjugate poles share a section."""
     rows = []
-    poles = sorted(poles, key=lambda p: (abs(p.imag) < 1e-9 * abs(p), abs(p), abs(p.imag), p.imag))
-    zeros = list(zeros)
-    for i in range(0, len(poles), 2):
-        pair = poles[i : i + 2]
-        mine, zeros = zeros[: len(pair)], zeros[len(pair) :]
-        rows.append([np.real(np.atleast_1d(np.poly(roots)))[::-1] for roots in (mine, pair)])
+    ordered = sorted(poles, key=lambda p: (abs(p.imag) < 1e-9 * abs(p), abs(p), abs(p.imag), p.imag))
+    for i in range(0, len(ordered), 2):
+        both = (zeros[i : i + 2], ordered[i : i + 2])
+        rows.append([np.real(np.atleast_1d(np.poly(roots)))[::-1] for roots in both])
     padded = np.array([[np.pad(part, (0, 3 - len(part))) for part in row] for row in rows])
     padded[0, 0] *= gain
     return Filter(padded[:, 0], padded[:, 1])

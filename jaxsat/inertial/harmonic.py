@@ -118,7 +118,7 @@ def learn(
         return fit.weights**2 + jnp.diagonal(fit.covariance), jnp.sum(m * ((s - mean) ** 2 + variance))
 
     def step(_, spectrum):
-        power, rest = jax.lax.map(lambda row: one(*row, spectrum), (signal, weight))
+        power, rest = jax.lax.map(lambda row: one(row[0], row[1], spectrum), (signal, weight))
         return Spectrum(group @ jnp.mean(power, axis=0), jnp.sum(rest) / jnp.sum(weight))
 
     return jax.lax.fori_loop(0, iterations, step, start)

@@ -106,7 +106,8 @@ def _propagate(
 ) -> tuple[Float[Array, "V L"], Float[Array, "V L"], Float[Array, ""]]:
     """Mean and variance of what each sample should have read, and the noise variance."""
 
-    def one(y, sign, there, scale, precision, shift, spectrum):
+    def one(row, spectrum):
+        y, sign, there, scale, precision, shift = row
         root = jnp.sqrt(spectrum.prior * scale)
         precision = jnp.where(there, 1 / spectrum.noise, precision)
         shift = jnp.where(there, y / spectrum.noise, shift)
@@ -138,7 +139,7 @@ def _propagate(
     def step(_, state):
         spectrum, scale, sites, _, _ = state
         rows = (y, sign, measured, scale, sites.precision, sites.shift)
-        precision, shift, reading, variance, power, rest = jax.lax.map(lambda row: one(*row, spectrum), rows)
+        precision, shift, reading, variance, power, rest = jax.lax.map(lambda row: one(row, spectrum), rows)
         sites = _Sites(
             jnp.where(sign == 0, 0.0, (1 - DAMPING) * sites.precision + DAMPING * precision),
             jnp.where(sign == 0, 0.0, (1 - DAMPING) * sites.shift + DAMPING * shift),
