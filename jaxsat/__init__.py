@@ -11,8 +11,10 @@ if TYPE_CHECKING:
     from jaxsat.attitude import Orientation, orient
     from jaxsat.config import Config, load_config
     from jaxsat.errors import InputError
+    from jaxsat.periodic import PeriodicEstimate, estimate_periodic
     from jaxsat.pipeline import Estimate, Trajectory, estimate
-    from jaxsat.present.folder import write_results
+    from jaxsat.present.folder import write_periodic, write_results
+    from jaxsat.saturation.harmonic_fill import fill_harmonic
     from jaxsat.signals.readers import read
     from jaxsat.signals.recording import Recording
     from jaxsat.studies.metrics import position_rmse
@@ -26,16 +28,20 @@ _HOME = {
     "InputError": "jaxsat.errors",
     "MOTIONS": "jaxsat.studies.motions",
     "Orientation": "jaxsat.attitude",
+    "PeriodicEstimate": "jaxsat.periodic",
     "Recording": "jaxsat.signals.recording",
     "Sensor": "jaxsat.studies.simulate",
     "Trajectory": "jaxsat.pipeline",
     "estimate": "jaxsat.pipeline",
+    "estimate_periodic": "jaxsat.periodic",
+    "fill_harmonic": "jaxsat.saturation.harmonic_fill",
     "load_config": "jaxsat.config",
     "orient": "jaxsat.attitude",
     "position_rmse": "jaxsat.studies.metrics",
     "read": "jaxsat.signals.readers",
     "simulate": "jaxsat.studies.simulate",
     "sweep": "jaxsat.studies.sweep",
+    "write_periodic": "jaxsat.present.folder",
     "write_results": "jaxsat.present.folder",
 }
 
@@ -45,16 +51,20 @@ __all__ = [  # noqa: RUF022 (the order of _HOME)
     "InputError",
     "MOTIONS",
     "Orientation",
+    "PeriodicEstimate",
     "Recording",
     "Sensor",
     "Trajectory",
     "estimate",
+    "estimate_periodic",
+    "fill_harmonic",
     "load_config",
     "orient",
     "position_rmse",
     "read",
     "simulate",
     "sweep",
+    "write_periodic",
     "write_results",
 ]
 

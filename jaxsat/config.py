@@ -115,6 +115,30 @@ class Orientation(_Section):
     )
 
 
+class Periodic(_Section):
+    """Periodic motion (`jaxsat periodic`)."""
+
+    method: Literal["least_squares", "recursive", "bmflc", "wflc"] = "least_squares"
+    band: Literal["auto"] | tuple[float, float] = Field(
+        default="auto", description="lowest and highest frequency of the motion (Hz)"
+    )
+    sensor_lowpass: Literal["none"] | float = Field(
+        default="none", description="cut-off of the first-order filter in the sensor (Hz)"
+    )
+    highpass: Literal["auto"] | float = Field(
+        default="auto",
+        description="cut-off before the combiners of the paper (Hz); auto: half of the band's low",
+    )
+    highpass_order: int = Field(default=4, ge=1, le=8)
+    frequencies: int = Field(
+        default=9, ge=1, le=99, description="across the band, of recursive, bmflc and wflc"
+    )
+    mu: float = Field(default=0.005, gt=0, lt=1, description="LMS gain of the amplitudes")
+    mu_frequency: float = Field(
+        default=1e-5, ge=0, description="LMS gain of the frequency of wflc, its input scaled to 1"
+    )
+
+
 class Config(_Section):
     """Everything that `estimate` can be told; unknown keys are errors."""
 
@@ -129,6 +153,7 @@ class Config(_Section):
     height: Height = Height()
     smoother: Smoother = Smoother()
     orientation: Orientation = Orientation()
+    periodic: Periodic = Periodic()
 
 
 def load_config(path: Path | None = None, **overrides: Any) -> Config:

@@ -14,6 +14,7 @@ ORDER = (
     "config",
     "pipeline",
     "attitude",
+    "periodic",
     "studies",
     "present",
     "demo",

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 # Imported for the commands that they add, in the order of the help.
-from jaxsat.cli import estimate, orientation, sweep, simulate  # noqa: F401 isort: skip
+from jaxsat.cli import estimate, orientation, periodic, sweep, simulate  # noqa: F401 isort: skip
 from jaxsat.cli.shared import app
 from jaxsat.errors import InputError
 

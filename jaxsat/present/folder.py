@@ -13,18 +13,27 @@ import pandas as pd
 
 from jaxsat.attitude import Orientation
 from jaxsat.errors import InputError
+from jaxsat.periodic import PeriodicEstimate
 from jaxsat.pipeline import Estimate
+from jaxsat.present.periodic import (
+    motion_table,
+    periodic_gaps_table,
+    periodic_signals_table,
+    summarise_periodic,
+)
 from jaxsat.present.report import Track, render_report
 from jaxsat.present.summary import summarise, summarise_orientation
 from jaxsat.present.tables import gaps_table, orientation_table, signals_table, trajectory_table
 
 _TABLES = {"trajectory": trajectory_table, "signals": signals_table, "gaps": gaps_table}
+_PERIODIC = {"periodic": motion_table, "signals": periodic_signals_table, "gaps": periodic_gaps_table}
 _KINDS = ("csv", "parquet")
 
 ESTIMATE_FILES = frozenset(
     {"summary.json", "report.html", *(f"{name}.{kind}" for name in _TABLES for kind in _KINDS)}
 )
 ORIENTATION_FILES = frozenset({"summary.json", *(f"orientation.{kind}" for kind in _KINDS)})
+PERIODIC_FILES = frozenset({"summary.json", *(f"{name}.{kind}" for name in _PERIODIC for kind in _KINDS)})
 SWEEP_FILES = frozenset({"summary.json", *(f"sweep.{kind}" for kind in _KINDS)})
 
 
@@ -85,6 +94,20 @@ def write_orientation(
         name = _write_table(orientation_table(found), new, "orientation", csv).name
         _write_summary(summarise_orientation(found, source), new)
     return folder / name
+
+
+def write_periodic(
+    found: PeriodicEstimate, folder: str | Path, *, csv: bool = False, source: Path | None = None
+) -> Path:
+    """Write the tables of a periodic estimate and its summary; returns the path of the motion's table.
+
+    A former folder of `jaxsat periodic` is replaced; raises `InputError` as `check_folder` does.
+    """
+    folder = Path(folder)
+    with _replaced(folder, PERIODIC_FILES) as new:
+        names = [_write_table(make(found), new, name, csv).name for name, make in _PERIODIC.items()]
+        _write_summary(summarise_periodic(found, source), new)
+    return folder / names[0]
 
 
 def write_sweep(

@@ -34,11 +34,11 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
     words = [Status(code).name.lower() for code in fills.status[busy]]
     floor = estimate.floor
     return {
-        "versions": _versions(),
-        "input": _input(estimate.recording, source),
+        "versions": versions(),
+        "input": input_summary(estimate.recording, source),
         "configuration": estimate.config.model_dump(mode="json"),
         "method": estimate.config.method,
-        "rails": _rails(estimate.rails, estimate.gaps),
+        "rails": rails_summary(estimate.rails, estimate.gaps),
         "rests": _rests(estimate.recording, estimate.rest),
         "segments": {
             "count": len(estimate.segments),
@@ -68,12 +68,12 @@ def summarise_orientation(found: Orientation, source: Path | None = None) -> dic
     gains = found.gains
     used = {name: float(getattr(gains, name)) for name in ("kp", "ki", "tau", "gate", "limit")}
     return {
-        "versions": _versions(),
-        "input": _input(found.recording, source),
+        "versions": versions(),
+        "input": input_summary(found.recording, source),
         "configuration": found.config.model_dump(mode="json"),
         "estimate": found.config.orientation.estimate,
         "gains": {name: value if np.isfinite(value) else "none" for name, value in used.items()},
-        "rails": _rails(found.rails, found.gaps),
+        "rails": rails_summary(found.rails, found.gaps),
         "gravity": float(found.start.gravity),
         "gyr_offset": found.start.offset.tolist(),
         "bias_at_the_end": found.bias[-1].tolist(),
@@ -93,8 +93,8 @@ def summarise_sweep(
     swept: the values of each parameter; sources: the files of the trials, whose SHA-256 is stored.
     """
     return {
-        "versions": _versions(),
-        "inputs": [{"file": str(path), "sha256": _hash(path)} for path in sources],
+        "versions": versions(),
+        "inputs": [{"file": str(path), "sha256": file_hash(path)} for path in sources],
         "configuration": config.model_dump(mode="json"),
         "swept": {
             name: [
@@ -108,16 +108,16 @@ def summarise_sweep(
     }
 
 
-def _input(recording: Recording, source: Path | None) -> dict[str, Any]:
+def input_summary(recording: Recording, source: Path | None) -> dict[str, Any]:
     return {
         "name": recording.name,
         "file": None if source is None else str(source),
-        "sha256": None if source is None else _hash(source),
-        **_extent(recording),
+        "sha256": None if source is None else file_hash(source),
+        **extent(recording),
     }
 
 
-def _hash(path: Path) -> str | None:
+def file_hash(path: Path) -> str | None:
     """SHA-256 of a file; None where it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -181,20 +181,20 @@ def inspect(recording: Recording, config: Config) -> dict[str, Any]:
     )
     return {
         "name": recording.name,
-        **_extent(recording),
+        **extent(recording),
         "specific_force_at_rest": float(np.linalg.norm(recording.acc[rest], axis=1).mean())
         if rest.any()
         else None,
         "lowest": dict(zip(CHANNELS, recording.signal.min(axis=0).tolist(), strict=True)),
         "highest": dict(zip(CHANNELS, recording.signal.max(axis=0).tolist(), strict=True)),
         "saturated": dict(zip(CHANNELS, saturated.sum(axis=0).tolist(), strict=True)),
-        "rails": _rails(rails, find_gaps(sign)),
+        "rails": rails_summary(rails, find_gaps(sign)),
         "rests": _rests(recording, rest),
         "warnings": warnings,
     }
 
 
-def _extent(recording: Recording) -> dict[str, Any]:
+def extent(recording: Recording) -> dict[str, Any]:
     return {
         "samples": len(recording),
         "rate": round(1 / recording.period, 6),
@@ -203,7 +203,7 @@ def _extent(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _rails(rails: Rails, gaps: Gaps) -> dict[str, Any]:
+def rails_summary(rails: Rails, gaps: Gaps) -> dict[str, Any]:
     """Per channel and side: the limit (null: none), how many samples lie there, and in how many gaps."""
     table = {}
     for j, channel in enumerate(CHANNELS):
@@ -233,7 +233,7 @@ def _rests(recording: Recording, rest: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     names = ("jaxsat", "jax", "jaxlib", "jaxopt", "equinox", "numpy", "scipy")
     device = jax.devices()[0]
     return {

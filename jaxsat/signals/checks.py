@@ -29,9 +29,9 @@ def check(recording: Recording) -> list[str]:
     gravity: see `spurious_acceleration`.
     """
     name = recording.name
-    _check_form(recording)
+    check_form(recording)
     warnings = [*_missing(recording)]
-    _check_wraps(recording)
+    check_wraps(recording)
     warnings += _check_gravity(recording)
     _check_stuck(recording)
     warnings += _check_units(recording)
@@ -39,7 +39,7 @@ def check(recording: Recording) -> list[str]:
     return [f"{name}: {warning}" for warning in warnings]
 
 
-def _check_form(recording: Recording) -> None:
+def check_form(recording: Recording) -> None:
     """The contract of a `Recording`: finite, uniform in time, long enough, at a rate that sensors have."""
     name, time = recording.name, recording.time
     if len(time) < 3 or time[-1] - time[0] < 0.5:
@@ -83,7 +83,7 @@ def _missing(recording: Recording) -> Iterator[str]:
         yield f"{rows.sum()} samples are missing, the longest gap has {length} at {at:.6g} s; they are interpolated."
 
 
-def _check_wraps(recording: Recording) -> None:
+def check_wraps(recording: Recording) -> None:
     """No channel leaves its range at one end and comes in again at the other.
 
     A 16-bit number that overflows jumps by the full range against its own slope, stays on the wrong side for
