@@ -121,8 +121,8 @@ def solve_segments(
     prior = None
     if options.method == "map":
         moving = ~jnp.asarray(trial.rows.rest)
-        channels = (jnp.asarray(x) for x in (trial.signal, trial.sign, trial.clean))
-        prior = learn(*channels, moving, jnp.asarray(trial.period)[0])
+        signal, sign, clean = map(jnp.asarray, (trial.signal, trial.sign, trial.clean))
+        prior = learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0])
 
     def solve(state, covariance, table, departure, arrival):
         segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
@@ -131,14 +131,21 @@ def solve_segments(
     return jax.vmap(solve)(states, covariances, table, departure, arrival)
 
 
-@eqx.filter_jit
-def _bias(trial: Trial, signal, extra, sd, start) -> Float[Array, "6"]:
+def trial_biases(
+    trial: Trial,
+    signal: Float[Arrays, "N 6"],
+    extra: Float[Arrays, "N 6"],
+    sd: Float[Arrays, "6"],
+    start: Float[Arrays, "6"],
+) -> Float[Array, "6"]:
+    """Biases of the sensors (rad/s, m/s²) by one step from `start`, given a filled signal; `extra` as above."""
     samples = Samples(signal, trial.period, trial.variance + extra)
     return estimate_biases(
         samples, trial.rows, trial.prior, trial.prior_covariance, trial.gravity, sd, 1, start
     )[0]
 
 
+_bias = eqx.filter_jit(trial_biases)
 _filter = eqx.filter_jit(filter_trial)
 _solve = eqx.filter_jit(solve_segments)
 

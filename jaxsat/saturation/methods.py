@@ -39,7 +39,8 @@ def search_space(method: Compensation, segment: Segment, free_peak_time: bool = 
     `map` searches every δ from where the signal prior alone puts it.
     free_peak_time: method 2 also searches where in the gap the peak lies, instead of fixing it by Eq. 21.
     """
-    if method == "map" and segment.known is not None:
+    if method == "map":
+        assert segment.known is not None, "the signal prior was gathered"
         nothing = jnp.zeros_like(segment.bound)
         start = dense_box_step(segment.known.slope, segment.known.precision, nothing, segment.bound)
         return Search(lambda delta: delta, segment.bound, start)

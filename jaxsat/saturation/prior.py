@@ -26,9 +26,9 @@ WIDTH = 2.0
 class SignalPrior(eqx.Module):
     """The prior of six channels."""
 
-    kernel: Float[Array, "6 K"]
+    kernel: Float[Array, "*six K"]
     """c(0), c(1), … of each channel, in 1/(its unit)²."""
-    innovation: Float[Array, "6"]
+    innovation: Float[Array, "*six"]
     """σ², the variance of a sample given all before it."""
 
 

@@ -13,7 +13,7 @@ from jaxsat.config import Config
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import Prepared
-from jaxsat.saturation.compensate import arrival_table, filter_trial, solve_segments
+from jaxsat.saturation.compensate import arrival_table, filter_trial, solve_segments, trial_biases
 from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
 from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
@@ -172,19 +172,28 @@ def score(
     for option in options:
 
         def once(before, _, option=option):
-            states, covariances = jax.tree.map(lambda x: x[at], filter_trial(trial, *before))
+            filled, extra, bias = before
+            filtered = filter_trial(trial, filled - bias[None], extra)
+            states, covariances = jax.tree.map(lambda x: x[at], filtered)
+            shifted = eqx.tree_at(lambda t: t.signal, trial, signal - bias[None])
             fill, values = solve_segments(
-                trial, states, covariances, case.table, case.departure, case.arrival, sizes, option
+                shifted, states, covariances, case.table, case.departure, case.arrival, sizes, option
             )
             place = (values.sample, values.channel)
             way = sign.at[place].get(mode="fill", fill_value=0)
             filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")
-            return (filled, unfilled.at[place].set(fill.variance, mode="drop")), (fill, values)
+            extra = unfilled.at[place].set(fill.variance, mode="drop")
+            if option.method == "map":
+                # A recording that does not saturate is left as it is.
+                moved = trial_biases(trial, filled, extra, option.bias_sd, bias)
+                bias = jnp.where(jnp.any(sign != 0), moved, 0.0)
+            return (filled, extra, bias), (fill, values)
 
         # A loop, not a repetition: the program is compiled once.
-        (filled, extra), every = jax.lax.scan(once, (signal, unfilled), None, length=sweeps)
+        begin = (signal, unfilled, jnp.zeros(6, signal.dtype))
+        (filled, extra, bias), every = jax.lax.scan(once, begin, None, length=sweeps)
         fill, values = jax.tree.map(lambda x: x[-1], every)
-        path = _smooth_path(trial, filled, trial.variance + extra, relinearisations)
+        path = _smooth_path(trial, filled - bias[None], trial.variance + extra, relinearisations)
         busy = jnp.any(values.sample < count, axis=1)
         order = jnp.asarray([_SEVERITY.index(status) for status in sorted(Status)])
         worst = jnp.max(jnp.where(busy, order[fill.solution.status], 0))

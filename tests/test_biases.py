@@ -1,0 +1,135 @@
+"""Biases in the smoother's problem: the quadratic against the smoother's own cost, and what they are in truth."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+from jaxsat.config import load_config
+from jaxsat.inertial.biases import bias_quadratic, estimate_biases
+from jaxsat.inertial.smoother import Rows, closed_loop, smooth_about
+from jaxsat.inertial.strapdown import NavState, Samples, advance, error_between, sample_intervals
+from jaxsat.pipeline import prepare
+from jaxsat.studies.motions import Walk
+from jaxsat.studies.simulate import Sensor, simulate
+
+N = 60
+REST = np.zeros(N, bool)
+REST[:8] = REST[25:33] = REST[50:] = True
+GYR_BIAS, ACC_BIAS = np.array([2e-3, -1e-3, 1.5e-3]), np.array([0.05, -0.03, 0.02])
+ESTIMATE = jax.jit(estimate_biases, static_argnames="steps")
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """A lively motion, and the corrected states of its filter to linearise about; heights are not observed."""
+    rest = problems.rows(REST)
+    rows = Rows(rest.rest, rest.velocity_variance, None, rest.height_variance)
+    prior, covariance = problems.departure()
+    samples = problems.samples(N)
+    reference, _ = closed_loop(samples, rows, prior, covariance, problems.GRAVITY)
+    # The quadratic has its prior at the first state of the reference.
+    reference = jax.tree.map(lambda x, first: x.at[0].set(first), reference, prior)
+    return reference, samples, rows, prior, covariance
+
+
+def shifted(samples: Samples, bias) -> Samples:
+    return eqx.tree_at(lambda s: s.signal, samples, samples.signal - bias[None])
+
+
+def test_without_biases_the_quadratic_is_the_cost_of_the_smoother(problem):
+    reference, samples, rows, _, covariance = problem
+    found = jax.jit(bias_quadratic)(reference, samples, rows, covariance, problems.GRAVITY)
+    cost = jax.jit(smooth_about)(reference, samples, rows, *problem[3:], problems.GRAVITY).cost
+    assert 0.5 * found[0, 0] == pytest.approx(float(cost), rel=1e-9)
+    np.testing.assert_allclose(found, found.T, rtol=1e-12)
+
+
+def dense_cost(reference, samples: Samples, rows: Rows, covariance, bias, moved):
+    """J about a fixed reference, by one dense Gaussian: every transition and noise is that of the unshifted samples.
+
+    moved: offsets of each step from a bias, from strapdown steps of shifted samples.
+    """
+    from jaxsat.inertial.strapdown import error_transition, sample_noise
+
+    mean, intervals = np.zeros((N + 1, 9)), sample_intervals(samples.signal, samples.period)
+    C = np.zeros((9 * (N + 1), 9 * (N + 1)))
+    C[:9, :9] = covariance
+    transitions = np.asarray(jax.vmap(error_transition)(reference.q_nb[:-1], intervals))
+    noises = jax.vmap(sample_noise)(
+        reference.q_nb[:-1], samples.signal, samples.period, samples.variance
+    )
+    offsets = moved(bias)
+    for k in range(N):
+        here, there, past = (slice(9 * i, 9 * i + 9) for i in (k, k + 1, 0))
+        past = slice(0, 9 * k + 9)
+        mean[k + 1] = transitions[k] @ mean[k] + offsets[k]
+        C[there, past] = transitions[k] @ C[here, past]
+        C[past, there] = C[there, past].T
+        C[there, there] = transitions[k] @ C[here, here] @ transitions[k].T + noises[k]
+    H = np.concatenate([9 * k + np.arange(6, 9) for k in np.flatnonzero(rows.rest)])
+    innovation = -np.asarray(reference.velocity)[np.flatnonzero(rows.rest)].ravel() - mean.ravel()[H]
+    S = C[np.ix_(H, H)] + float(rows.velocity_variance) * np.eye(len(H))
+    return 0.5 * innovation @ np.linalg.solve(S, innovation)
+
+
+def test_gradient_and_hessian_equal_differences_of_a_dense_cost(problem):
+    """The effect of a bias on each step is taken from the strapdown itself, by central differences."""
+    reference, samples, rows, _, covariance = problem
+    found = np.asarray(jax.jit(bias_quadratic)(reference, samples, rows, covariance, problems.GRAVITY))
+    start, end = (jax.tree.map(lambda x, s=s: x[s], reference) for s in (slice(None, -1), slice(1, None)))
+
+    @jax.jit
+    def offsets(bias):
+        intervals = sample_intervals(samples.signal - bias[None], samples.period)
+        step = lambda a, i, b: error_between(advance(a, i, problems.GRAVITY), b)  # noqa: E731
+        return jax.vmap(step)(start, intervals, end)
+
+    zero, h = jnp.zeros(6), 1e-4
+    effect = np.stack([(offsets(h * e) - offsets(-h * e)) / (2 * h) for e in np.eye(6)], axis=-1)
+    linear = lambda bias: np.asarray(offsets(zero)) + effect @ bias  # noqa: E731
+    cost = lambda bias: dense_cost(reference, samples, rows, covariance, bias, linear)  # noqa: E731
+    unit = np.repeat([1e-2, 1e-1], 3)
+    E = np.diag(unit)
+    gradient = np.array([(cost(e) - cost(-e)) / 2 for e in E])
+    hessian = np.array([[(cost(a + b) - cost(a - b) - cost(b - a) + cost(-a - b)) / 4 for b in E] for a in E])
+    tolerance = 2e-3  # the step's own linearisation at the middle of a sample
+    np.testing.assert_allclose(found[0, 1:] * unit, gradient, atol=tolerance * np.abs(gradient).max())
+    expected = found[1:, 1:] * np.outer(unit, unit)
+    np.testing.assert_allclose(expected, hessian, atol=tolerance * np.abs(hessian).max())
+
+
+@pytest.fixture(scope="module")
+def biased_walk():
+    motion = Walk(strides=6)
+    sensor = Sensor(gyr_bias=GYR_BIAS, acc_bias=ACC_BIAS)
+    duration = float(motion.moving[-1, 1]) + 1.0
+    recording, truth = simulate(motion, rate=100.0, duration=duration, sensor=sensor, key=jax.random.key(2))
+    recording = eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None)
+    settings = {"smoother.gyr_offset": "none", "gravity": 9.80665, "rails.gyr": "none", "rails.acc": "none"}
+    return jax.tree.map(jnp.asarray, prepare(recording, load_config(None, **settings)).trial)
+
+
+def found_on(trial, sd, steps=3):
+    samples = Samples(trial.signal, trial.period, trial.variance)
+    prior = NavState(*jax.tree.leaves(trial.prior))
+    given = (samples, trial.rows, prior, trial.prior_covariance, trial.gravity, jnp.asarray(sd))
+    return ESTIMATE(*given, steps=steps, start=jnp.zeros(6))
+
+
+def test_biases_of_a_simulated_walk_are_found_within_their_own_sd(biased_walk):
+    prior_sd = np.repeat([5e-3, 0.1], 3)
+    bias, covariance = found_on(biased_walk, prior_sd)
+    sd, truth = np.sqrt(np.diag(covariance)), np.concatenate([GYR_BIAS, ACC_BIAS])
+    assert (np.abs(bias - truth) < 4.0 * sd).all()
+    # They are learned, not only allowed: horizontal rates and the vertical force far better than the prior knew.
+    assert (sd <= prior_sd * (1 + 1e-9)).all() and (sd < 0.2 * prior_sd).sum() >= 3
+    np.testing.assert_allclose(bias[5], truth[5], atol=0.01)
+
+
+def test_biases_that_cannot_be_are_zero(biased_walk):
+    bias, covariance = found_on(biased_walk, np.full(6, 1e-9))
+    assert np.abs(bias).max() < 1e-9
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 1e-9, rtol=1e-3)
