@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from jaxsat.saturation.solvers import Box, Status, box_step, projected_gauss_newton, projected_gradient
+from jaxsat.saturation.solvers import (
+    Box,
+    Status,
+    box_step,
+    dense_box_step,
+    projected_gauss_newton,
+    projected_gradient,
+)
 
 RNG = np.random.default_rng(4)
 A = RNG.normal(size=(6, 8)) * np.geomspace(1.0, 30.0, 8)
@@ -99,3 +106,35 @@ def test_box_step_is_the_solution_of_the_bounded_quadratic_problem(damping):
     assert (slope[np.asarray(d) <= low + 1e-12] >= 0).all() and (
         slope[np.asarray(d) >= high - 1e-12] <= 0
     ).all()
+
+
+STEP = jax.jit(dense_box_step)
+
+
+@pytest.mark.parametrize("width", [0.02, 0.3, 1e3])
+@pytest.mark.parametrize("seed", range(5))
+def test_dense_box_step_is_the_solution_of_the_bounded_quadratic_problem(seed, width):
+    """From a box that holds almost everything to one that holds nothing; some variables have no range."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(12, 10)) * np.geomspace(0.1, 10.0, 10)
+    hessian, wanted = root.T @ root, rng.normal(size=10) / np.geomspace(0.1, 10.0, 10)
+    gradient = -hessian @ wanted
+    low, high = -width * rng.uniform(0.1, 1.0, 10), width * rng.uniform(0.1, 1.0, 10)
+    low[3] = high[3] = 0.01
+    d = np.asarray(STEP(*map(jnp.asarray, (gradient, hessian, low, high))))
+    assert (d >= low).all() and (d <= high).all()
+    target = np.linalg.solve(root.T @ root, -gradient)
+    value = gradient @ d + 0.5 * d @ hessian @ d
+    free = np.arange(10) != 3
+    # The same as least squares, the fixed variable taken out.
+    rest = root @ target - root[:, 3] * low[3]
+    oracle = lsq_linear(root[:, free], rest, (low[free], high[free]), method="bvls", tol=1e-14)
+    expected = np.insert(oracle.x, 3, low[3])
+    np.testing.assert_allclose(d, expected, atol=1e-6 * (1.0 + np.abs(expected).max()))
+    assert value <= gradient @ expected + 0.5 * expected @ hessian @ expected + 1e-9 * np.abs(gradient).max()
+    slope = gradient + hessian @ d
+    inside = (d > low) & (d < high)
+    assert inside.sum() == 9 if width == 1e3 else inside.sum() < 9
+    tolerance = 1e-6 * np.abs(gradient).max()
+    assert (np.abs(slope[inside]) < tolerance).all()
+    assert (slope[(d == low) & free] > -tolerance).all() and (slope[(d == high) & free] < tolerance).all()

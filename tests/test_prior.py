@@ -1,0 +1,165 @@
+"""The signal prior: learned from what it may see, and its quadratic form against the energy written out."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsat.saturation.prior import ORDER, WIDTH, Known, SignalPrior, learn, of_values, spread
+
+N = 3000
+PERIOD = jnp.asarray(0.01)
+# Poles well inside the circle, so that the second difference is stationary.
+PHI = -np.poly([0.8 * np.exp(0.5j), 0.8 * np.exp(-0.5j), 0.6, -0.4]).real[1:]
+SIGMA = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
+LEARN = jax.jit(learn)
+
+
+def filter_of(phi) -> np.ndarray:
+    """a of a ∗ x = white noise."""
+    return np.convolve([1.0, -2.0, 1.0], np.concatenate([[1.0], -np.asarray(phi)]))
+
+
+def kernel_of(a, variance) -> np.ndarray:
+    return np.correlate(a, a, "full")[len(a) - 1 :] / variance
+
+
+@pytest.fixture(scope="module")
+def walk() -> np.ndarray:
+    """Six integrated autoregressions of the module's order."""
+    assert len(PHI) == ORDER
+    noise = SIGMA * np.random.default_rng(3).normal(size=(N, 6))
+    second = np.zeros((N, 6))
+    for k in range(ORDER, N):
+        second[k] = noise[k] + sum(PHI[i] * second[k - 1 - i] for i in range(ORDER))
+    return np.cumsum(np.cumsum(second, axis=0), axis=0)
+
+
+def learned(signal, sign=None, clean=None, moving=None) -> SignalPrior:
+    sign = np.zeros((N, 6), int) if sign is None else sign
+    clean = (sign == 0) if clean is None else clean
+    moving = np.ones(N, bool) if moving is None else moving
+    return LEARN(*map(jnp.asarray, (signal, sign, clean, moving)), PERIOD)
+
+
+def test_the_process_that_made_a_signal_is_learned(walk):
+    found = learned(walk)
+    np.testing.assert_allclose(found.innovation, SIGMA**2, rtol=0.1)
+    expected = np.stack([kernel_of(filter_of(PHI), variance) for variance in SIGMA**2])
+    np.testing.assert_allclose(found.kernel / expected[:, :1], expected / expected[:, :1], atol=0.05)
+    # Far from what the prior of the coefficients alone says.
+    blank = kernel_of(filter_of(np.zeros(ORDER)), 1.0)
+    assert np.abs(expected[0] / expected[0, 0] - blank / blank[0]).max() > 0.1
+
+
+def test_saturated_and_resting_samples_are_not_looked_at(walk):
+    sign = np.zeros((N, 6), int)
+    sign[500:520], sign[1500:1510, 2] = 1, -1
+    clean = sign == 0
+    clean[900:910, 4] = False
+    moving = np.ones(N, bool)
+    moving[2000:2300] = False
+    hidden = ~clean | ~moving[:, None]
+    spoilt = np.where(hidden, 1e3 * np.random.default_rng(0).normal(size=walk.shape), walk)
+    expected, found = (learned(x, sign, clean, moving) for x in (walk, spoilt))
+    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9)
+    seen = learned(spoilt)
+    assert (seen.innovation > 10.0 * expected.innovation).all()
+
+
+def test_recordings_side_by_side_are_those_one_by_one(walk):
+    both = jnp.stack([jnp.asarray(walk), jnp.asarray(walk[::-1] + 1.0)])
+    sign, moving = jnp.zeros((N, 6), int), jnp.ones(N, bool)
+    found = jax.jit(jax.vmap(lambda x: learn(x, sign, sign == 0, moving, PERIOD)))(both)
+    for i, signal in enumerate(both):
+        one = learned(signal)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(found), strict=True):
+            np.testing.assert_allclose(b[i], a, rtol=1e-8)
+
+
+# Neighbours in one channel, one apart, one alone in another channel, and two padded ones.
+SAMPLE, CHANNEL = np.array([30, 31, 32, 35, 32, 0, 0]), np.array([1, 1, 1, 1, 4, 0, 0])
+SIGN, M = np.array([1.0, 1.0, 1.0, -1.0, -1.0, 0.0, 0.0]), 7
+SHORT = np.random.default_rng(5).normal(size=(60, 6)) + 3.0
+OF_VALUES = jax.jit(of_values)
+
+
+@pytest.fixture(scope="module")
+def prior() -> SignalPrior:
+    kernel = np.stack([kernel_of(filter_of(PHI), variance) for variance in SIGMA**2])
+    return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2))
+
+
+def known(prior, signal=SHORT, sample=SAMPLE, channel=CHANNEL, sign=SIGN) -> Known:
+    return OF_VALUES(prior, *map(jnp.asarray, (signal, sample, channel, sign)))
+
+
+def energy(delta) -> float:
+    """½ Σ (a ∗ x)²/σ² of the filled signal, and the pull of each value to zero."""
+    real = SIGN != 0
+    filled = SHORT.copy()
+    np.add.at(filled, (SAMPLE[real], CHANNEL[real]), (SIGN * delta)[real])
+    rough = np.stack([np.convolve(x, filter_of(PHI), "valid") for x in filled.T], axis=1)
+    rail = np.abs(SHORT[SAMPLE, CHANNEL])[real]
+    pull = np.sum((filled[SAMPLE, CHANNEL][real] / (WIDTH * rail)) ** 2)
+    return 0.5 * np.sum(rough**2 / SIGMA**2) + 0.5 * pull
+
+
+def test_the_quadratic_form_is_the_energy_of_the_filled_signal(prior):
+    found, E = known(prior), np.eye(M)
+    slope = [(energy(e) - energy(-e)) / 2 for e in E]
+    real = SIGN != 0
+    np.testing.assert_allclose(found.slope, slope, atol=1e-8 * np.abs(slope).max())
+    curvature = np.array([[energy(a + b) - energy(a) - energy(b) + energy(0 * a) for b in E] for a in E])
+    expected = curvature + np.diag(np.where(real, 0.0, 1.0))
+    np.testing.assert_allclose(found.precision, expected, atol=1e-8 * np.abs(expected).max())
+    assert np.linalg.eigvalsh(found.precision).min() > 0.0
+
+
+def test_padded_values_have_no_effect(prior):
+    found, bare = known(prior), known(prior, sample=SAMPLE[:5], channel=CHANNEL[:5], sign=SIGN[:5])
+    np.testing.assert_allclose(found.precision[:5, :5], bare.precision, rtol=1e-12)
+    np.testing.assert_allclose(found.slope[:5], bare.slope, rtol=1e-12)
+    # Even where they lie on a real one, or behind the end.
+    moved = SAMPLE.copy()
+    moved[5:] = 31, 200
+    again = known(prior, sample=moved, channel=np.array([*CHANNEL[:5], 1, 1]))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(found.precision[5:], np.eye(M)[5:])
+    assert not np.asarray(found.slope[5:]).any()
+
+
+def test_errors_of_a_gap_are_as_uncertain_together_as_they_are(prior):
+    found = known(prior)
+    gap, real = jnp.array([0, 0, 0, 1, 2, 6, 6]), jnp.asarray(SIGN != 0)
+    variance = np.asarray(jax.jit(spread)(found, gap, real))
+    covariance = np.linalg.inv(found.precision)
+    floor = 0.1 * np.diag(covariance)
+    assert (variance[:5] >= floor[:5] * (1 - 1e-9)).all() and not variance[5:].any()
+    for members in ([0, 1, 2], [3], [4]):
+        free = variance[members] > floor[members] * (1 + 1e-6)
+        assert free.all(), "this gap is not floored"
+        together = covariance[np.ix_(members, members)].sum()
+        np.testing.assert_allclose(variance[members].sum(), together, rtol=1e-9)
+    # Errors of a gap go together: their sum is less certain than that of independent ones.
+    assert variance[:3].sum() > 1.5 * np.diag(covariance)[:3].sum()
+
+
+def test_a_value_whose_row_is_negative_keeps_some_variance():
+    covariance = np.array([[1.0, -1.3], [-1.3, 4.0]])
+    given = Known(jnp.asarray(np.linalg.inv(covariance)), jnp.zeros(2))
+    found = spread(given, jnp.array([0, 0]), jnp.array([True, True]))
+    assert 0.0 < found[0] < 1.0
+    np.testing.assert_allclose(found[1], 2.7, rtol=1e-9)
+
+
+def test_the_mode_of_a_gap_is_the_most_probable_signal(prior):
+    """Without rests the prior alone interpolates: minimising Ω, b gives back the least energy."""
+    found = known(prior)
+    best = np.linalg.solve(found.precision, -np.asarray(found.slope))
+    rng = np.random.default_rng(1)
+    assert all(energy(best) < energy(best + 0.1 * rng.normal(size=M) * (SIGN != 0)) for _ in range(20))
+    assert eqx.tree_equal(found, known(prior))
