@@ -10,7 +10,15 @@ import pytest
 from jaxsat.config import load_config
 from jaxsat.inertial.biases import bias_quadratic, estimate_biases
 from jaxsat.inertial.smoother import Rows, closed_loop, smooth_about
-from jaxsat.inertial.strapdown import NavState, Samples, advance, error_between, sample_intervals
+from jaxsat.inertial.strapdown import (
+    NavState,
+    Samples,
+    advance,
+    error_between,
+    error_transition,
+    sample_intervals,
+    sample_noise,
+)
 from jaxsat.pipeline import prepare
 from jaxsat.studies.motions import Walk
 from jaxsat.studies.simulate import Sensor, simulate
@@ -35,10 +43,6 @@ def problem():
     return reference, samples, rows, prior, covariance
 
 
-def shifted(samples: Samples, bias) -> Samples:
-    return eqx.tree_at(lambda s: s.signal, samples, samples.signal - bias[None])
-
-
 def test_without_biases_the_quadratic_is_the_cost_of_the_smoother(problem):
     reference, samples, rows, _, covariance = problem
     found = jax.jit(bias_quadratic)(reference, samples, rows, covariance, problems.GRAVITY)
@@ -48,19 +52,15 @@ def test_without_biases_the_quadratic_is_the_cost_of_the_smoother(problem):
 
 
 def dense_cost(reference, samples: Samples, rows: Rows, covariance, bias, moved):
-    """J about a fixed reference, by one dense Gaussian: every transition and noise is that of the unshifted samples.
+    """J about a fixed reference, by one dense Gaussian; transitions and noise are those of the unshifted samples.
 
-    moved: offsets of each step from a bias, from strapdown steps of shifted samples.
+    moved: the offset of each step from the reference, given a bias.
     """
-    from jaxsat.inertial.strapdown import error_transition, sample_noise
-
     mean, intervals = np.zeros((N + 1, 9)), sample_intervals(samples.signal, samples.period)
     C = np.zeros((9 * (N + 1), 9 * (N + 1)))
     C[:9, :9] = covariance
     transitions = np.asarray(jax.vmap(error_transition)(reference.q_nb[:-1], intervals))
-    noises = jax.vmap(sample_noise)(
-        reference.q_nb[:-1], samples.signal, samples.period, samples.variance
-    )
+    noises = jax.vmap(sample_noise)(reference.q_nb[:-1], samples.signal, samples.period, samples.variance)
     offsets = moved(bias)
     for k in range(N):
         here, there, past = (slice(9 * i, 9 * i + 9) for i in (k, k + 1, 0))
