@@ -59,7 +59,7 @@ def estimate_command(
     out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
     method: Annotated[
         str | None,
-        typer.Option(help="standard, direct, triangle or quadratic (default: direct)", metavar="NAME"),
+        typer.Option(help="standard, direct, triangle, quadratic or map (default: direct)", metavar="NAME"),
     ] = None,
     config: ConfigPath = None,
     format: Format = "auto",

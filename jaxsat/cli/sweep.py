@@ -47,7 +47,7 @@ def sweep_command(
     method: Annotated[
         list[str] | None,
         typer.Option(
-            help="standard, direct, triangle or quadratic; repeatable (default: standard and direct)",
+            help="standard, direct, triangle, quadratic or map; repeatable (default: standard, direct)",
             metavar="NAME",
         ),
     ] = None,

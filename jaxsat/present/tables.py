@@ -66,8 +66,8 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
     the gap and no limit is known, the extreme measured value), `peak` (extreme filled value, signed), `impulse`
     (time integral of what was added, rad or m/s), `status` (how the search of the gap's segment ended:
     `converged`, `max_iterations`, `no_arrival` where no rest follows, or `ignored` by method standard).
-    `peak_sd`, `impulse_sd` and `identified` are empty: methods standard, direct, triangle and quadratic find one
-    best signal, not a distribution, so they cannot say how well a gap is known.
+    `peak_sd`, `impulse_sd` and `identified` are empty: every method finds one best signal, not a distribution of
+    the whole gap, so none can say how well a gap is known.
     """
     gaps, recording = estimate.gaps, estimate.recording
     period, added = recording.period, estimate.filled - recording.signal
