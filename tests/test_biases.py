@@ -51,28 +51,32 @@ def test_without_biases_the_quadratic_is_the_cost_of_the_smoother(problem):
     np.testing.assert_allclose(found, found.T, rtol=1e-12)
 
 
-def dense_cost(reference, samples: Samples, rows: Rows, covariance, bias, moved):
-    """J about a fixed reference, by one dense Gaussian; transitions and noise are those of the unshifted samples.
-
-    moved: the offset of each step from the reference, given a bias.
-    """
-    mean, intervals = np.zeros((N + 1, 9)), sample_intervals(samples.signal, samples.period)
+def dense_cost(reference, samples: Samples, rows: Rows, covariance):
+    """J of the offsets of all steps about a fixed reference, by one dense Gaussian of all states."""
+    intervals = sample_intervals(samples.signal, samples.period)
+    at = reference.q_nb[:-1]
+    transitions = np.asarray(jax.vmap(error_transition)(at, intervals))
+    noises = np.asarray(jax.vmap(sample_noise)(at, samples.signal, samples.period, samples.variance))
     C = np.zeros((9 * (N + 1), 9 * (N + 1)))
     C[:9, :9] = covariance
-    transitions = np.asarray(jax.vmap(error_transition)(reference.q_nb[:-1], intervals))
-    noises = jax.vmap(sample_noise)(reference.q_nb[:-1], samples.signal, samples.period, samples.variance)
-    offsets = moved(bias)
     for k in range(N):
-        here, there, past = (slice(9 * i, 9 * i + 9) for i in (k, k + 1, 0))
-        past = slice(0, 9 * k + 9)
-        mean[k + 1] = transitions[k] @ mean[k] + offsets[k]
+        here, there, past = slice(9 * k, 9 * k + 9), slice(9 * k + 9, 9 * k + 18), slice(0, 9 * k + 9)
         C[there, past] = transitions[k] @ C[here, past]
         C[past, there] = C[there, past].T
         C[there, there] = transitions[k] @ C[here, here] @ transitions[k].T + noises[k]
-    H = np.concatenate([9 * k + np.arange(6, 9) for k in np.flatnonzero(rows.rest)])
-    innovation = -np.asarray(reference.velocity)[np.flatnonzero(rows.rest)].ravel() - mean.ravel()[H]
+    rest = np.flatnonzero(rows.rest)
+    H = np.concatenate([9 * k + np.arange(6, 9) for k in rest])
     S = C[np.ix_(H, H)] + float(rows.velocity_variance) * np.eye(len(H))
-    return 0.5 * innovation @ np.linalg.solve(S, innovation)
+    measured = -np.asarray(reference.velocity)[rest].ravel()
+
+    def cost(offsets) -> float:
+        mean = np.zeros((N + 1, 9))
+        for k in range(N):
+            mean[k + 1] = transitions[k] @ mean[k] + offsets[k]
+        innovation = measured - mean.ravel()[H]
+        return 0.5 * innovation @ np.linalg.solve(S, innovation)
+
+    return cost
 
 
 def test_gradient_and_hessian_equal_differences_of_a_dense_cost(problem):
@@ -84,13 +88,17 @@ def test_gradient_and_hessian_equal_differences_of_a_dense_cost(problem):
     @jax.jit
     def offsets(bias):
         intervals = sample_intervals(samples.signal - bias[None], samples.period)
-        step = lambda a, i, b: error_between(advance(a, i, problems.GRAVITY), b)  # noqa: E731
-        return jax.vmap(step)(start, intervals, end)
+        return jax.vmap(lambda a, i, b: error_between(advance(a, i, problems.GRAVITY), b))(
+            start, intervals, end
+        )
 
     zero, h = jnp.zeros(6), 1e-4
     effect = np.stack([(offsets(h * e) - offsets(-h * e)) / (2 * h) for e in np.eye(6)], axis=-1)
-    linear = lambda bias: np.asarray(offsets(zero)) + effect @ bias  # noqa: E731
-    cost = lambda bias: dense_cost(reference, samples, rows, covariance, bias, linear)  # noqa: E731
+    of_offsets, unbiased = dense_cost(reference, samples, rows, covariance), np.asarray(offsets(zero))
+
+    def cost(bias):
+        return of_offsets(unbiased + effect @ bias)
+
     unit = np.repeat([1e-2, 1e-1], 3)
     E = np.diag(unit)
     gradient = np.array([(cost(e) - cost(-e)) / 2 for e in E])

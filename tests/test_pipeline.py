@@ -8,7 +8,8 @@ import pytest
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
 from jaxsat.pipeline import estimate
-from jaxsat.studies.metrics import position_rmse
+from jaxsat.signals.readers import read
+from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
 from jaxsat.studies.motions import Bar, Walk
 from jaxsat.studies.simulate import Sensor, simulate
 
@@ -66,7 +67,38 @@ def test_filled_signal_lies_beyond_the_rail_and_near_the_truth():
     assert error < 0.1 * ignored
 
 
-@pytest.mark.parametrize("method", PAPER)
+def test_map_leaves_at_most_a_tenth_of_the_error_on_the_bar():
+    """Six seeds of the same; biases, of which the sensor has none, cost nothing."""
+    ratios = []
+    for seed in range(6):
+        recording, truth = bar(seed, gyr_rail=7.5)
+        found = estimate(recording, load_config(None, method="map", **BAR))
+        standard = np.linalg.norm(found.standard_position[-1] - truth.position[-1])
+        ratios.append(last_error(found, truth) / standard)
+        added = (found.filled - recording.signal)[truth.saturated]
+        assert found.fills.status.tolist() == [0]
+        assert (added >= 0.0).all() and (added <= 5.0 * (1 + 1e-9)).all()
+        # The prior knows more than the bounds do.
+        assert found.signal_sd[truth.saturated].max() < 5.0 / np.sqrt(12.0)
+    assert max(ratios) <= 0.1
+
+
+@pytest.mark.slow
+def test_map_on_a_recording_that_truly_saturated(shared_data):
+    """A PyShoe trial, scored by Vicon. Slow: a minute of samples is compiled for its own sizes."""
+    path = shared_data / "pyshoe" / "2017-12-15-18-00-40.mat"
+    if not path.is_file():
+        pytest.skip(f"the trial is not at {path}")
+    recording = read(path)
+    found = estimate(recording, load_config(None, method="map"))
+    _, truth = load_pyshoe_truth(path, at=recording.time)
+    mapped, standard = (
+        position_rmse(position, truth) for position in (found.trajectory.position, found.standard_position)
+    )
+    assert mapped <= 0.7 * standard
+
+
+@pytest.mark.parametrize("method", [*PAPER, "map"])
 def test_without_saturation_every_method_is_standard_to_the_last_bit(method):
     recording, _ = bar(0)
     plain = estimate(recording, load_config(None, method="standard"))
