@@ -155,7 +155,7 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     )
     real = segment.bound > 0.0
     # Where no prior says better, a value lies anywhere within its bounds: uniform in 0 ≤ δ ≤ δ_b.
-    variance = segment.bound**2 / 12.0 if known is None else spread(known, segment.gap, real)
+    variance = segment.bound**2 / 12.0 if known is None else jnp.where(real, spread(known), 0.0)
     at_bound = real & (delta >= segment.bound * (1.0 - 1e-9))
     return SegmentFill(
         delta=delta, cost_before=before, solution=solution, variance=variance, at_bound=at_bound
