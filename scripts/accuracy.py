@@ -129,51 +129,59 @@ def rms_height(position, truth) -> float:
 
 
 def board(table: pd.DataFrame) -> Iterator[Row]:
-    def of(part, kind, method, column, trial=None):
+    def of(part, kind, method, column, trial=None) -> np.ndarray:
         at = (table["part"] == part) & (table["kind"] == kind) & (table["method"] == method)
-        at &= True if trial is None else table["trial"] == trial
-        return table[at].sort_values("trial")[column].to_numpy()
+        if trial is not None:
+            at &= table["trial"] == trial
+        return table.loc[at].set_index("trial")[column].sort_index().to_numpy()
+
+    def lower(metric, value, unit, goal, note) -> Row:
+        return Row(metric, float(value), unit, "lower", goal if metric.endswith("_map") else None, None, note)
 
     parts = set(table["part"])
     if "pyshoe" in parts:
-        standard = {c: of("pyshoe", "saturated", "standard", c) for c in ("rmse_3d", "rmse_2d")}
+        saturated = "12 saturated trials"
         for method in METHODS[1:]:
-            for column, axes in (("rmse_3d", "3d"), ("rmse_2d", "2d")):
-                mine = of("pyshoe", "saturated", method, column)
-                goal = 0.70 if method == "map" else None
-                yield Row(f"pyshoe_ratio_{axes}_{method}", geometric_mean_ratio(mine, standard[column]), "1", "lower", goal, None, "12 saturated trials, geometric mean of the ratio to standard")  # fmt: skip
-            mine = of("pyshoe", "saturated", method, "rmse_3d")
-            worst, mean = float((mine / standard["rmse_3d"]).max()), float(mine.mean())
-            yield Row(f"pyshoe_worst_3d_{method}", worst, "1", "lower", 1.02 if method == "map" else None, None, "the worst of these ratios")  # fmt: skip
-            yield Row(f"pyshoe_mean_3d_{method}", mean, "m", "lower", None, None, "mean RMSE of these trials")
-            own = of("pyshoe", "own rests", method, "rmse_3d") / of(
-                "pyshoe", "own rests", "standard", "rmse_3d"
-            )
-            yield Row(f"pyshoe_ratio_3d_own_rests_{method}", float(np.exp(np.log(own).mean())), "1", "lower", None, None, "with rests found by the package")  # fmt: skip
-        yield Row("pyshoe_mean_3d_standard", float(standard["rmse_3d"].mean()), "m", "lower", 0.085, None, "mean RMSE of these trials")  # fmt: skip
+            for kind, name in (("saturated", ""), ("own rests", "own_rests_")):
+                for column, axes in (("rmse_3d", "3d"), ("rmse_2d", "2d")):
+                    mine, theirs = (of("pyshoe", kind, m, column) for m in (method, "standard"))
+                    ratio, what = geometric_mean_ratio(mine, theirs), f"{saturated}, {kind}"
+                    metric = f"pyshoe_ratio_{axes}_{name}{method}"
+                    yield lower(metric, ratio, "1", 0.70, f"{what}: geometric mean of the ratio to standard")
+                    metric = f"pyshoe_worst_{axes}_{name}{method}"
+                    yield lower(metric, (mine / theirs).max(), "1", 1.02, f"{what}: worst of these ratios")
+        for method in METHODS:
+            mean = of("pyshoe", "saturated", method, "rmse_3d").mean()
+            yield lower(f"pyshoe_mean_3d_{method}", mean, "m", None, f"{saturated}: mean RMSE")
         every = np.concatenate([of("pyshoe", k, "standard", "pyshoe_3d") for k in ("saturated", "other")])
-        yield Row("pyshoe_metric_standard", float(every.mean()), "m", "lower", 0.050, None, "all 26 trials, PyShoe's metric; the best of its five published results per trial: 0.054")  # fmt: skip
+        note = "all 26 trials, PyShoe's metric; the best of its five published results per trial: 0.054"
+        yield Row("pyshoe_metric_standard", float(every.mean()), "m", "lower", 0.050, None, note)
     if "clipped" in parts:
         whole = of("clipped", "unclipped", "standard", "rmse_3d").mean()
         for rail, goal in ((350, 0.98), (250, 0.95), (200, 0.90)):
             lost = of("clipped", f"{rail} °/s", "standard", "rmse_3d").mean()
+            note = (
+                f"share of what clipping loses that comes back; unclipped {whole:.3f} m, ignored {lost:.3f} m"
+            )
             for method in METHODS[1:]:
                 share = 1 - (of("clipped", f"{rail} °/s", method, "rmse_3d").mean() - whole) / (lost - whole)
-                yield Row(f"recovered_{rail}_{method}", float(share), "1", "higher", goal if method == "map" else None, None, f"share of the accuracy lost by clipping that comes back; unclipped {whole:.3f} m, ignored {lost:.3f} m")  # fmt: skip
-    for part, kind, column, name, goals in (
-        ("gaitmap", "300 °/s", "rmse_2d", "xy", {"left": 0.16, "right": 0.16}),
-        ("gaitmap", "8 g", "rmse_z", "z", {"left": 0.31, "right": 0.22}),
+                goal_here = goal if method == "map" else None
+                yield Row(f"recovered_{rail}_{method}", float(share), "1", "higher", goal_here, None, note)
+    for kind, column, name, goals in (
+        ("300 °/s", "rmse_2d", "300dps_xy", {"left": 0.16, "right": 0.16}),
+        ("8 g", "rmse_z", "8g_z", {"left": 0.31, "right": 0.22}),
     ):
-        for side, goal in goals.items() if part in parts else ():
-            without = float(of(part, "unclipped", "standard", column, side)[0])
+        for side, goal in goals.items() if "gaitmap" in parts else ():
+            without = of("gaitmap", "unclipped", "standard", column, side)[0]
             for method in METHODS:
-                value = float(of(part, kind, method, column, side)[0])
-                yield Row(f"gaitmap_{side}_{kind.replace(' ', '').replace('°/s', 'dps')}_{name}_{method}", value, "m", "lower", goal if method == "map" else None, None, f"RMS to motion capture; unclipped {without:.3f} m")  # fmt: skip
+                value = of("gaitmap", kind, method, column, side)[0]
+                note = f"RMS to motion capture; unclipped {without:.3f} m"
+                yield lower(f"gaitmap_{side}_{name}_{method}", value, "m", goal, note)
     for part, goals in (("openshoe", {350: 0.10, 300: 0.20}), ("xio", {500: 0.05, 400: 0.15})):
         for rail, goal in goals.items() if part in parts else ():
             for method in METHODS:
-                value = float(of(part, f"{rail} °/s", method, "rmse_3d")[0])
-                yield Row(f"{part}_{rail}_{method}", value, "m", "lower", goal if method == "map" else None, None, "RMS to its own unclipped path")  # fmt: skip
+                value = of(part, f"{rail} °/s", method, "rmse_3d")[0]
+                yield lower(f"{part}_{rail}_{method}", value, "m", goal, "RMS to its own unclipped path")
 
 
 PARTS = {
