@@ -58,8 +58,8 @@ class Estimate(eqx.Module):
     filled: Float[np.ndarray, "N 6"]
     """The recording's six channels with saturated values replaced (rad/s, m/s²)."""
     signal_sd: Float[np.ndarray, "N 6"]
-    """sd of each value of `filled`: sensor noise, or where it was filled by methods 1 and 2 that of a value
-    anywhere within its bounds, because they do not say more."""
+    """sd of each value of `filled`: sensor noise; where it was filled, by methods 1 and 2 that of a value anywhere
+    within its bounds, because they do not say more, by `map` that of its signal prior."""
     fills: Fills
     standard_position: Float[np.ndarray, "N 3"]
     """Where the standard smoother, which ignores saturation, puts the sensor (m)."""
