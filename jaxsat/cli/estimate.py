@@ -1,8 +1,7 @@
 """`jaxsat inspect` and `jaxsat estimate`: one recording."""
 
 import json
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -10,19 +9,23 @@ from jaxsat.cli.shared import (
     AccRail,
     AccUnit,
     ConfigPath,
+    Csv,
     Format,
     GyrRail,
     GyrUnit,
     NegateAcc,
+    Out,
+    Quiet,
     Rate,
     RecordingPath,
     RestColumn,
     SensorName,
+    Strict,
     app,
-    limit,
     progress_bar,
+    rail_overrides,
     read_recording,
-    scales,
+    tell,
     use_compilation_cache,
 )
 
@@ -56,7 +59,7 @@ def inspect_command(
 @app.command("estimate")
 def estimate_command(
     recording: RecordingPath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
+    out: Out,
     method: Annotated[
         str | None,
         typer.Option(help="standard, direct, triangle, quadratic or map (default: direct)", metavar="NAME"),
@@ -76,9 +79,9 @@ def estimate_command(
         str | None,
         typer.Option(help="what is known of the height of rests: off, zero or nonnegative", metavar="MODE"),
     ] = None,
-    csv: Annotated[bool, typer.Option("--csv", help="write CSV instead of Parquet")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing unless something is wrong")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="exit with code 3 if there are warnings")] = False,
+    csv: Csv = False,
+    quiet: Quiet = False,
+    strict: Strict = False,
 ) -> None:
     """Reconstruct the trajectory of a recording and write it, with a report, to a folder."""
     from jaxsat.config import load_config
@@ -100,24 +103,4 @@ def estimate_command(
         if settings.method != "standard" and len(found.gaps):
             beside["standard"] = (measured.time, found.standard_position)
         report = write_results(found, out, csv=csv, source=recording, beside=beside)
-    warnings = warnings_of(found)
-    if not quiet:
-        typer.echo(estimate_text(found, report))
-        for warning in warnings:
-            typer.echo(f"jaxsat: warning: {warning}", err=True)
-    if strict and warnings:
-        raise typer.Exit(3)
-
-
-def rail_overrides(
-    gyr: str | None, acc: str | None, gyr_unit: str | None, acc_unit: str | None
-) -> dict[str, Any]:
-    """Overrides of the configuration; a magnitude is in the unit that was declared for the file."""
-    scale = scales(gyr_unit, acc_unit)
-    overrides = {}
-    for name, text in (("gyr", gyr), ("acc", acc)):
-        if text in ("auto", "none"):
-            overrides[f"rails.{name}"] = text
-        elif text is not None:
-            overrides[f"rails.{name}"] = limit(name, text, "auto, none") * scale[name]
-    return overrides
+    tell(estimate_text(found, report), warnings_of(found), quiet, strict)

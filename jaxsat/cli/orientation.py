@@ -1,24 +1,28 @@
 """`jaxsat orientation`: attitude alone."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from jaxsat.cli.estimate import rail_overrides
 from jaxsat.cli.shared import (
     AccRail,
     AccUnit,
     ConfigPath,
+    Csv,
     Format,
     GyrRail,
     GyrUnit,
     NegateAcc,
+    Out,
+    Quiet,
     Rate,
     RecordingPath,
     SensorName,
+    Strict,
     app,
+    rail_overrides,
     read_recording,
+    tell,
     use_compilation_cache,
 )
 
@@ -26,7 +30,7 @@ from jaxsat.cli.shared import (
 @app.command("orientation")
 def orientation_command(
     recording: RecordingPath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
+    out: Out,
     estimate: Annotated[
         str | None,
         typer.Option(help="gyro, accel, gyro_accel, pi or smoothed (default: smoothed)", metavar="NAME"),
@@ -55,9 +59,9 @@ def orientation_command(
     acc_rail: AccRail = None,
     sensor: SensorName = None,
     negate_acc: NegateAcc = False,
-    csv: Annotated[bool, typer.Option("--csv", help="write CSV instead of Parquet")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing unless something is wrong")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="exit with code 3 if there are warnings")] = False,
+    csv: Csv = False,
+    quiet: Quiet = False,
+    strict: Strict = False,
 ) -> None:
     """Estimate the attitude of a recording from gyroscope and accelerometer, and write it to a folder."""
     from jaxsat.config import load_config
@@ -82,9 +86,4 @@ def orientation_command(
 
     found = orient(measured, settings)
     path = write_orientation(found, out, csv=csv, source=recording)
-    if not quiet:
-        typer.echo(orientation_text(found, path))
-        for warning in found.warnings:
-            typer.echo(f"jaxsat: warning: {warning}", err=True)
-    if strict and found.warnings:
-        raise typer.Exit(3)
+    tell(orientation_text(found, path), found.warnings, quiet, strict)

@@ -1,24 +1,28 @@
 """`jaxsat periodic`: position and angle of periodic motion."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from jaxsat.cli.estimate import rail_overrides
 from jaxsat.cli.shared import (
     AccRail,
     AccUnit,
     ConfigPath,
+    Csv,
     Format,
     GyrRail,
     GyrUnit,
     NegateAcc,
+    Out,
+    Quiet,
     Rate,
     RecordingPath,
     SensorName,
+    Strict,
     app,
+    rail_overrides,
     read_recording,
+    tell,
     use_compilation_cache,
 )
 
@@ -26,7 +30,7 @@ from jaxsat.cli.shared import (
 @app.command("periodic")
 def periodic_command(
     recording: RecordingPath,
-    out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
+    out: Out,
     method: Annotated[
         str | None,
         typer.Option(help="least_squares, recursive, bmflc or wflc (default: least_squares)", metavar="NAME"),
@@ -55,9 +59,9 @@ def periodic_command(
     acc_rail: AccRail = None,
     sensor: SensorName = None,
     negate_acc: NegateAcc = False,
-    csv: Annotated[bool, typer.Option("--csv", help="write CSV instead of Parquet")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing unless something is wrong")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="exit with code 3 if there are warnings")] = False,
+    csv: Csv = False,
+    quiet: Quiet = False,
+    strict: Strict = False,
 ) -> None:
     """Position and angle of periodic motion, without drift, rests or attitude."""
     from jaxsat.config import load_config
@@ -74,9 +78,4 @@ def periodic_command(
 
     found = estimate_periodic(measured, settings)
     path = write_periodic(found, out, csv=csv, source=recording)
-    if not quiet:
-        typer.echo(periodic_text(found, path))
-        for warning in found.warnings:
-            typer.echo(f"jaxsat: warning: {warning}", err=True)
-    if strict and found.warnings:
-        raise typer.Exit(3)
+    tell(periodic_text(found, path), found.warnings, quiet, strict)

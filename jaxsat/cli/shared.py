@@ -46,6 +46,11 @@ SensorName = Annotated[
 NegateAcc = Annotated[bool, typer.Option("--negate-acc", help="the sensor reports minus the specific force")]
 ConfigPath = Annotated[Path | None, typer.Option(help="TOML file with settings; options override it")]
 
+Out = Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")]
+Csv = Annotated[bool, typer.Option("--csv", help="write CSV instead of Parquet")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing unless something is wrong")]
+Strict = Annotated[bool, typer.Option("--strict", help="exit with code 3 if there are warnings")]
+
 
 def read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc):
     import equinox as eqx
@@ -78,6 +83,20 @@ def scales(gyr_unit: str | None, acc_unit: str | None) -> dict[str, float]:
     }
 
 
+def rail_overrides(
+    gyr: str | None, acc: str | None, gyr_unit: str | None, acc_unit: str | None
+) -> dict[str, Any]:
+    """Overrides of the configuration; a magnitude is in the unit that was declared for the file."""
+    scale = scales(gyr_unit, acc_unit)
+    overrides = {}
+    for name, text in (("gyr", gyr), ("acc", acc)):
+        if text in ("auto", "none"):
+            overrides[f"rails.{name}"] = text
+        elif text is not None:
+            overrides[f"rails.{name}"] = limit(name, text, "auto, none") * scale[name]
+    return overrides
+
+
 def limit(name: str, text: str, words: str) -> float:
     try:
         return float(text)
@@ -93,6 +112,16 @@ def use_compilation_cache() -> None:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(base / "jaxsat"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def tell(text: str, warnings: list[str], quiet: bool, strict: bool) -> None:
+    """The last words of a command that worked: its text, its warnings, and exit code 3 if these count."""
+    if not quiet:
+        typer.echo(text)
+        for warning in warnings:
+            typer.echo(f"jaxsat: warning: {warning}", err=True)
+    if strict and warnings:
+        raise typer.Exit(3)
 
 
 @contextlib.contextmanager

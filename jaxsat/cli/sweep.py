@@ -9,9 +9,12 @@ import typer
 from jaxsat.cli.shared import (
     AccUnit,
     ConfigPath,
+    Csv,
     Format,
     GyrUnit,
     NegateAcc,
+    Out,
+    Quiet,
     Rate,
     RestColumn,
     SensorName,
@@ -33,7 +36,7 @@ def sweep_command(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="RECORDING...", help="files with recordings, one trial each")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")],
+    out: Out,
     gyr_rail: Rails = None,
     acc_rail: Rails = None,
     gyr_bound: Annotated[
@@ -60,8 +63,8 @@ def sweep_command(
     rests: RestColumn = None,
     sensor: SensorName = None,
     negate_acc: NegateAcc = False,
-    csv: Annotated[bool, typer.Option("--csv", help="write CSV instead of Parquet")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing unless something is wrong")] = False,
+    csv: Csv = False,
+    quiet: Quiet = False,
 ) -> None:
     """Clip recordings at many rails in software, reconstruct them, and tabulate how far off each is."""
     from jaxsat.config import load_config

@@ -11,14 +11,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial import kalman
 from jaxsat.inertial.rotations import quat_exp, quat_multiply, quat_to_matrix
-from jaxsat.inertial.smoother import VELOCITY, Rows, smooth
+from jaxsat.inertial.smoother import VELOCITY, Rows, linearised, smooth
 from jaxsat.inertial.strapdown import (
     NavState,
     Samples,
-    advance,
-    error_between,
     error_transition,
-    sample_intervals,
     sample_noise,
 )
 
@@ -34,10 +31,7 @@ def bias_quadratic(
 
     reference: N+1 states to linearise about; height rows are not used.
     """
-    intervals = sample_intervals(samples.signal, samples.period)
-    start = jax.tree.map(lambda x: x[:-1], reference)
-    end = jax.tree.map(lambda x: x[1:], reference)
-    offsets = jax.vmap(lambda a, i, b: error_between(advance(a, i, gravity), b))(start, intervals, end)
+    start, intervals, offsets = linearised(reference, samples, gravity)
 
     def step(carry, inputs):
         mean, covariance, total = carry

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial import kalman
 from jaxsat.inertial.strapdown import (
+    Interval,
     NavState,
     Samples,
     add_error,
@@ -125,6 +126,20 @@ def closed_loop(
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last)
 
 
+def linearised(
+    reference: NavState, samples: Samples, gravity: Float[Array, ""]
+) -> tuple[NavState, Interval, Float[Array, "N 9"]]:
+    """Of N+1 reference states: those at the starts of samples, the samples as intervals, and the defects.
+
+    A defect is the error by which the reference does not follow its sample; zero for a strapdown.
+    """
+    intervals = sample_intervals(samples.signal, samples.period)
+    start = jax.tree.map(lambda x: x[:-1], reference)
+    end = jax.tree.map(lambda x: x[1:], reference)
+    defects = jax.vmap(lambda a, i, b: error_between(advance(a, i, gravity), b))(start, intervals, end)
+    return start, intervals, defects
+
+
 def smooth_about(
     reference: NavState,
     samples: Samples,
@@ -138,10 +153,7 @@ def smooth_about(
     Where the reference does not follow the sensors (a corrected or already smoothed trajectory) its defects
     enter as known offsets, so repeating the call at its own result is Gauss-Newton on the nonlinear problem.
     """
-    intervals = sample_intervals(samples.signal, samples.period)
-    start = jax.tree.map(lambda x: x[:-1], reference)
-    end = jax.tree.map(lambda x: x[1:], reference)
-    offsets = jax.vmap(lambda a, i, b: error_between(advance(a, i, gravity), b))(start, intervals, end)
+    start, intervals, offsets = linearised(reference, samples, gravity)
 
     def forward(carry, inputs):
         mean, covariance, cost = carry

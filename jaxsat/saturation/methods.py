@@ -1,4 +1,4 @@
-"""Methods 1 and 2: what is searched, and the search of one segment (paper A, Section 4)."""
+"""Methods 1 and 2 and `map`: what is searched, and the search of one segment (paper A, Section 4)."""
 
 from collections.abc import Callable
 from typing import Literal
