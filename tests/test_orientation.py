@@ -186,7 +186,11 @@ def test_gradients_are_finite_in_free_fall_and_without_gate_or_low_pass():
     signal = still(20)
     signal[5, 3:] = 0.0
     for direction in ("mean", "unit"):
-        slope = jax.grad(lambda kp: run(signal, Gains(kp, 0.1), tilted(0.1), direction=direction).q_nb[-1, 1])  # noqa: B023
+        slope = jax.grad(
+            lambda kp, direction=direction: run(
+                signal, Gains(kp, 0.1), tilted(0.1), direction=direction
+            ).q_nb[-1, 1]
+        )
         assert np.isfinite(slope(1.0))
 
 
@@ -200,7 +204,7 @@ def test_vmap_equals_a_loop_over_trials_and_gains(key):
     together = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(signals, gains)
     for i in range(3):
         for j in range(2):
-            alone = one(signals[i], jax.tree.map(lambda x: x[j], gains))  # noqa: B023
+            alone = one(signals[i], jax.tree.map(lambda x, j=j: x[j], gains))
             np.testing.assert_allclose(together[i, j], alone, atol=1e-14)
 
 

@@ -351,7 +351,9 @@ def test_tilting_gravity_is_taken_off_where_there_is_a_gyroscope():
 
 def test_the_band_is_found_or_its_absence_is_said_with_what_remains(key):
     _, _, acc, _ = shaken(seconds=10.0)
-    low, peak, high = find_band(acc, 0.01)  # type: ignore[misc]
+    band = find_band(acc, 0.01)
+    assert band is not None
+    low, peak, high = band
     assert low < 6 < high and peak == pytest.approx(6, abs=0.3)
     noise = np.asarray(jax.random.normal(key, (3000, 6)))
     assert find_band(noise[:, :3], 0.01) is None

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-# Terms that predict the second difference. On the PyShoe walks of the list `clip`, filled by the prior alone, the RMS error
-# of a gap's integral with 1, 2, 4, 6 terms is 15, 15, 18, 21 mrad clipped at 350 °/s and 62, 58, 46, 52 mrad at 250 °/s.
+# Terms that predict the second difference. On the PyShoe walks of the list `clip`, filled by the prior alone, the RMS
+# error of a gap's integral with 1, 2, 4, 6 terms is 15, 15, 18, 21 mrad clipped at 350 °/s and 62, 58, 46, 52 mrad
+# at 250 °/s.
 ORDER = 4
 # An autoregression is learned from samples within so many seconds of a gap of its channel: movement that is as
 # fast as what was lost, not the average of rest and movement.
