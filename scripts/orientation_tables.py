@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from peers import import_peer
 from scipy.ndimage import uniform_filter1d
 
 from jaxsat.attitude import orient
@@ -226,22 +227,17 @@ def offset_taken_off(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def madgwick(recording: Recording, gain: float) -> np.ndarray:
-    from ahrs.filters import Madgwick
-
     gyr, q0 = offset_taken_off(recording)
-    return Madgwick(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, gain=gain, q0=q0).Q
+    return import_peer("ahrs.filters").Madgwick(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, gain=gain, q0=q0).Q
 
 
 def mahony(recording: Recording, kp: float, ki: float) -> np.ndarray:
-    from ahrs.filters import Mahony
-
     gyr, q0 = offset_taken_off(recording)
-    return Mahony(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, k_P=kp, k_I=ki, q0=q0).Q
+    return import_peer("ahrs.filters").Mahony(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, k_P=kp, k_I=ki, q0=q0).Q
 
 
 def vqf(recording: Recording, offline: bool) -> np.ndarray:
-    import vqf as package
-
+    package = import_peer("vqf")
     gyr, acc = np.ascontiguousarray(recording.gyr), np.ascontiguousarray(recording.acc)
     if offline:
         return package.offlineVQF(gyr, acc, None, recording.period, {})["quat6D"]
