@@ -227,13 +227,13 @@ def offset_taken_off(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def madgwick(recording: Recording, gain: float) -> np.ndarray:
-    gyr, q0 = offset_taken_off(recording)
-    return import_peer("ahrs.filters").Madgwick(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, gain=gain, q0=q0).Q
+    filters, (gyr, q0) = import_peer("ahrs.filters"), offset_taken_off(recording)
+    return filters.Madgwick(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, gain=gain, q0=q0).Q
 
 
 def mahony(recording: Recording, kp: float, ki: float) -> np.ndarray:
-    gyr, q0 = offset_taken_off(recording)
-    return import_peer("ahrs.filters").Mahony(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, k_P=kp, k_I=ki, q0=q0).Q
+    filters, (gyr, q0) = import_peer("ahrs.filters"), offset_taken_off(recording)
+    return filters.Mahony(gyr=gyr, acc=recording.acc, frequency=1 / recording.period, k_P=kp, k_I=ki, q0=q0).Q
 
 
 def vqf(recording: Recording, offline: bool) -> np.ndarray:
