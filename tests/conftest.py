@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+# Compiling is most of the time of the tests, and a program without LLVM's optimisations is compiled in half of it.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
 import jax
 import pytest
 

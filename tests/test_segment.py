@@ -63,7 +63,7 @@ def oracle(delta, height: bool, departure=None):
     return smooth_about(reference, samples, rows, state, covariance, problems.GRAVITY).cost
 
 
-@pytest.mark.parametrize("height", [False, True])
+@pytest.mark.parametrize("height", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_objective_and_gradient_equal_the_sample_by_sample_filter(height):
     segment = build(height)
     value, gradient = jax.jit(jax.value_and_grad(lambda d: oracle(d, height)))(DELTA)

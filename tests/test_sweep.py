@@ -142,7 +142,9 @@ def test_a_budget_of_memory_changes_no_number(table, trials):
     pd.testing.assert_frame_equal(chunked, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("rails", "memory"), [(1, 2e9), (32, chunk_of(6))])
+@pytest.mark.parametrize(
+    ("rails", "memory"), [pytest.param(1, 2e9, marks=pytest.mark.slow), (32, chunk_of(6))]
+)
 def test_many_rails_are_one_program(trials, rails, memory):
     original, traces = elements._scores.__wrapped__, []
 
