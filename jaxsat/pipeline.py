@@ -275,9 +275,9 @@ def _trial(
         height[arrivals[arrivals > first]] = True
     rows = Rows(
         rest=jnp.asarray(rest),
-        velocity_variance=jnp.asarray(noise.rest_velocity_sd**2),
+        velocity_variance=jnp.full(n, noise.rest_velocity_sd**2),
         height=None if height is None else jnp.asarray(height),
-        height_variance=jnp.asarray(config.height.sd**2),
+        height_variance=jnp.full(n, config.height.sd**2),
     )
     trial = Trial(
         signal=signal,

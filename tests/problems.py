@@ -27,7 +27,8 @@ def samples(count: int = 60, seed: int = 0, isotropic: bool = False) -> Samples:
 def rows(rest: np.ndarray, height: np.ndarray | None = None) -> Rows:
     """Zero velocity to 1 cm/s, height to 2 cm."""
     height = np.zeros_like(rest) if height is None else height
-    return Rows(jnp.asarray(rest), jnp.asarray(1e-4), jnp.asarray(height), jnp.asarray(4e-4))
+    everywhere = jnp.ones(len(rest))
+    return Rows(jnp.asarray(rest), 1e-4 * everywhere, jnp.asarray(height), 4e-4 * everywhere)
 
 
 def departure(seed: int = 0) -> tuple[NavState, jnp.ndarray]:

@@ -66,7 +66,7 @@ def dense_cost(reference, samples: Samples, rows: Rows, covariance):
         C[there, there] = transitions[k] @ C[here, here] @ transitions[k].T + noises[k]
     rest = np.flatnonzero(rows.rest)
     H = np.concatenate([9 * k + np.arange(6, 9) for k in rest])
-    S = C[np.ix_(H, H)] + float(rows.velocity_variance) * np.eye(len(H))
+    S = C[np.ix_(H, H)] + float(rows.velocity_variance[0]) * np.eye(len(H))
     measured = -np.asarray(reference.velocity)[rest].ravel()
 
     def cost(offsets) -> float:

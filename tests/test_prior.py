@@ -82,6 +82,7 @@ def test_recordings_side_by_side_are_those_one_by_one(walk):
 # Neighbours in one channel, one apart, one alone in another channel, and two padded ones.
 SAMPLE, CHANNEL = np.array([30, 31, 32, 35, 32, 0, 0]), np.array([1, 1, 1, 1, 4, 0, 0])
 SIGN, M = np.array([1.0, 1.0, 1.0, -1.0, -1.0, 0.0, 0.0]), 7
+LENGTH = np.array([3.0, 3.0, 3.0, 1.0, 1.0, 0.0, 0.0])
 SHORT = np.random.default_rng(5).normal(size=(60, 6)) + 3.0
 OF_VALUES = jax.jit(of_values)
 
@@ -93,17 +94,18 @@ def prior() -> SignalPrior:
 
 
 def known(prior, signal=SHORT, sample=SAMPLE, channel=CHANNEL, sign=SIGN) -> Known:
-    return OF_VALUES(prior, *map(jnp.asarray, (signal, sample, channel, sign)))
+    given = signal, sample, channel, sign, LENGTH[: len(sign)]
+    return OF_VALUES(prior, *map(jnp.asarray, given))
 
 
 def energy(delta) -> float:
-    """½ Σ (a ∗ x)²/σ² of the filled signal, and the pull of each value to zero."""
+    """½ Σ (a ∗ x)²/σ² of the filled signal, and the pull of each gap's values to their rail."""
     real = SIGN != 0
     filled = SHORT.copy()
     np.add.at(filled, (SAMPLE[real], CHANNEL[real]), (SIGN * delta)[real])
     rough = np.stack([np.convolve(x, filter_of(PHI), "valid") for x in filled.T], axis=1)
     rail = np.abs(SHORT[SAMPLE, CHANNEL])[real]
-    pull = np.sum((filled[SAMPLE, CHANNEL][real] / (WIDTH * rail)) ** 2)
+    pull = np.sum((delta[real] / (WIDTH * rail)) ** 2 / LENGTH[real])
     return 0.5 * np.sum(rough**2 / SIGMA**2) + 0.5 * pull
 
 

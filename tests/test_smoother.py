@@ -64,11 +64,11 @@ def dense(reference, samples, rows, prior, prior_covariance, extra_rows=None):
             if rows.rest[k]:
                 H.append(9 * k + index)
                 z.append(-reference.velocity[k, axis])
-                r.append(rows.velocity_variance)
+                r.append(rows.velocity_variance[k])
         if rows.height[k]:
             H.append(9 * k + HEIGHT)
             z.append(-reference.position[k, 2])
-            r.append(rows.height_variance)
+            r.append(rows.height_variance[k])
     flat, L = mean.ravel(), root.reshape(size, size)
     C = L @ L.T
     S = C[np.ix_(H, H)] + np.diag(r)
@@ -210,7 +210,7 @@ def test_height_inequality_is_the_solution_of_the_bounded_quadratic_problem():
         for active in ([], [25], [50], [25, 50]):
             flags = np.zeros(N, bool)
             flags[active] = True
-            exact = eqx.tree_at(lambda r: r.height_variance, problems.rows(REST, flags), jnp.asarray(0.0))
+            exact = eqx.tree_at(lambda r: r.height_variance, problems.rows(REST, flags), jnp.zeros(len(REST)))
             tried = SMOOTH(samples, exact, prior, covariance, problems.GRAVITY, jnp.asarray(4))
             if (tried.state.position[:-1, 2][HEIGHTS] > -1e-8).all():
                 costs.append(float(tried.cost))

@@ -35,10 +35,10 @@ def bias_quadratic(
 
     def step(carry, inputs):
         mean, covariance, total = carry
-        state, interval, sample, offset, rest = inputs
+        state, interval, sample, offset, row = inputs
         for axis, index in enumerate(VELOCITY):
             column = covariance[:, index]
-            weight = jnp.where(rest, 1.0 / (column[index] + rows.velocity_variance), 0.0)
+            weight = jnp.where(row.rest, 1.0 / (column[index] + row.velocity_variance), 0.0)
             innovation = -mean[index].at[0].add(state.velocity[axis])
             total = total + weight * jnp.outer(innovation, innovation)
             mean = mean + weight * jnp.outer(column, innovation)
@@ -60,7 +60,7 @@ def bias_quadratic(
         return (jnp.concatenate([shift[:, None], moved], axis=1), covariance, total), None
 
     carry = (jnp.zeros((9, 7)), prior_covariance, jnp.zeros((7, 7)))
-    (_, _, total), _ = jax.lax.scan(step, carry, (start, intervals, samples, offsets, rows.rest))
+    (_, _, total), _ = jax.lax.scan(step, carry, (start, intervals, samples, offsets, rows))
     return total
 
 

@@ -33,19 +33,19 @@ HEIGHT, VELOCITY = 5, (6, 7, 8)
 class Rows(eqx.Module):
     """What is known of the states without a sensor; state k is the start of sample k."""
 
-    rest: Bool[Array, "N"]
+    rest: Bool[Array, "*N"]
     """Zero velocity at state k."""
-    velocity_variance: Float[Array, ""]
-    """Of each axis at rest (m²/s²)."""
-    height: Bool[Array, "N"] | None
+    velocity_variance: Float[Array, "*N"]
+    """Of each axis of that velocity (m²/s²)."""
+    height: Bool[Array, "*N"] | None
     """Zero height at state k; None where heights are not used at all."""
-    height_variance: Float[Array, ""]
-    """Of a height row (m²); zero makes it exact."""
+    height_variance: Float[Array, "*N"]
+    """Of that height (m²); zero makes it exact."""
 
     def marked(self, change: Callable[[Any], Any]) -> "Rows":
         """With the flags of rests and heights changed alike."""
-        height = None if self.height is None else jnp.asarray(change(self.height))
-        return Rows(jnp.asarray(change(self.rest)), self.velocity_variance, height, self.height_variance)
+        height = None if self.height is None else change(self.height)
+        return Rows(change(self.rest), self.velocity_variance, height, self.height_variance)
 
 
 class Smoothed(eqx.Module):
@@ -71,14 +71,12 @@ def update_rows(
     covariance: Float[Array, "n n"],
     state: NavState,
     rows: Rows,
-    rest: Bool[Array, ""],
-    height: Bool[Array, ""] | None,
 ) -> tuple[Float[Array, "n"], Float[Array, "n n"], Float[Array, ""], list[kalman.Row]]:
-    """The rows of one state on the error about the reference `state`; rest, height: its flags in `rows`."""
+    """The rows of one state on the error about the reference `state`."""
     cost, done = jnp.zeros_like(state.velocity[0]), []
-    known = [(-v, rows.velocity_variance, rest) for v in state.velocity]
-    if height is not None:
-        known.append((-state.position[2], rows.height_variance, height))
+    known = [(-v, rows.velocity_variance, rows.rest) for v in state.velocity]
+    if rows.height is not None:
+        known.append((-state.position[2], rows.height_variance, rows.height))
     for index, row in zip(_observed(rows, len(mean)), known, strict=True):
         mean, covariance, extra, done_row = kalman.update_row(mean, covariance, index, *row)
         cost, done = cost + extra, [*done, done_row]
@@ -108,9 +106,9 @@ def closed_loop(
 
     def step(carry, inputs):
         state, covariance = carry
-        interval, sample, rest, height = inputs
+        interval, sample, row = inputs
         nothing = jnp.zeros(size, covariance.dtype)
-        mean, covariance, _, _ = update_rows(nothing, covariance, state, rows, rest, height)
+        mean, covariance, _, _ = update_rows(nothing, covariance, state, row)
         unseen = jnp.zeros(9 - size, mean.dtype)
         state = add_error(state, jnp.concatenate([mean[:3], unseen, mean[3:]]))
         transition = part(error_transition(state.q_nb, interval))
@@ -120,9 +118,7 @@ def closed_loop(
         return (advance(state, interval, gravity), predicted), (state, covariance)
 
     intervals = sample_intervals(samples.signal, samples.period)
-    last, corrected = jax.lax.scan(
-        step, (prior, part(prior_covariance)), (intervals, samples, rows.rest, rows.height)
-    )
+    last, corrected = jax.lax.scan(step, (prior, part(prior_covariance)), (intervals, samples, rows))
     return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last)
 
 
@@ -157,8 +153,8 @@ def smooth_about(
 
     def forward(carry, inputs):
         mean, covariance, cost = carry
-        state, interval, sample, offset, rest, height = inputs
-        mean, covariance, extra, row = update_rows(mean, covariance, state, rows, rest, height)
+        state, interval, sample, offset, known = inputs
+        mean, covariance, extra, row = update_rows(mean, covariance, state, known)
         predicted = kalman.predict(
             mean,
             covariance,
@@ -183,7 +179,7 @@ def smooth_about(
     (last_mean, last_covariance, cost), (mean, covariance, row) = jax.lax.scan(
         forward,
         (initial_error, prior_covariance, zero),
-        (start, intervals, samples, offsets, rows.rest, rows.height),
+        (start, intervals, samples, offsets, rows),
     )
     nothing = kalman.Adjoint(jnp.zeros_like(last_mean), jnp.zeros_like(last_covariance))
     _, (error, smoothed, multiplier) = jax.lax.scan(
@@ -242,7 +238,7 @@ def smooth_nonnegative(
     """
     candidates = rows.height
     assert candidates is not None, "there are heights to keep"
-    zero = jnp.zeros_like(gravity)
+    zero = jnp.zeros_like(rows.height_variance)
 
     def solve(active):
         exact = Rows(rows.rest, rows.velocity_variance, active, zero)

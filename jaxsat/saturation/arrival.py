@@ -39,7 +39,7 @@ def arrivals(
         rest = (at < end) & rows.rest[here]
         for index in (3, 4, 5):
             column = P[:, index]
-            weight = jnp.where(rest, 1.0 / (column[index] + rows.velocity_variance), 0.0)
+            weight = jnp.where(rest, 1.0 / (column[index] + rows.velocity_variance[here]), 0.0)
             innovation = -mean[index]
             table = table + weight * jnp.outer(innovation, innovation)
             mean = mean + weight * jnp.outer(column, innovation)

@@ -248,7 +248,7 @@ def _filter_to(trial: Trial, fills: Fills, state: NavState, covariance, start: i
         return pad(np.asarray(x)[start : stop + 1], size)
 
     fresh = np.arange(size) >= (0 if start == 0 else 1)
-    rows = trial.rows.marked(lambda flags: span(flags) & fresh)
+    rows = jax.tree.map(span, trial.rows).marked(lambda flags: flags & fresh)
     part = Trial(
         signal=span(trial.signal),
         period=span(trial.period),

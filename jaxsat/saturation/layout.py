@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -48,7 +49,7 @@ class Trial(eqx.Module):
             # 256, 384, 512, 768, …: a third is wasted at most.
             size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
         extra = {name: pad(np.asarray(getattr(self, name)), size) for name in _SAMPLED}
-        rows = self.rows.marked(lambda flags: pad(np.asarray(flags), size))
+        rows = jax.tree.map(lambda x: pad(np.asarray(x), size), self.rows)
         return eqx.tree_at(
             lambda t: (*(getattr(t, name) for name in _SAMPLED), t.rows), self, (*extra.values(), rows)
         )
@@ -137,7 +138,8 @@ def gather(
     way = jnp.where(valid, sign[sample, channel], 0).astype(signal.dtype)
     known = None
     if prior is not None:
-        known = of_values(prior, jnp.asarray(trial.signal), start + sample, channel, way)
+        length = jnp.zeros(m).at[gap].add(jnp.abs(way))[gap]
+        known = of_values(prior, jnp.asarray(trial.signal), start + sample, channel, way, length)
     segment = Segment(
         signal=signal,
         period=window(trial.period),
@@ -154,7 +156,7 @@ def gather(
         departure_covariance=covariance,
         arrival=table,
         height=height,
-        height_variance=jnp.asarray(trial.rows.height_variance),
+        height_variance=jnp.asarray(trial.rows.height_variance)[jnp.clip(arrival, 0, count - 1)],
         known=known,
     )
     return segment, place

@@ -4,7 +4,8 @@ Each channel is an integrated autoregression: its second difference is predicted
 remains is white. Interpolation under it is smooth like a spline but keeps the rhythm of the channel. The energy
 ½ Σ (a ∗ x)²/σ² of a signal x is quadratic, so all that is needed of it is the precision kernel c = a ⋆ a / σ²
 (autocorrelation of a): Ω_ij = c(|i − j|) between saturated samples i and j of a channel. Unlike a pure difference
-penalty the prior is proper: a value is also known to lie within a few rails of zero, which only long gaps feel.
+penalty the prior is proper: what a gap lost on average is also known to be a fraction of the rail, which only long
+gaps feel.
 """
 
 import equinox as eqx
@@ -21,8 +22,8 @@ ORDER = 4
 REACH = 0.1
 # Windows without which the channel's other movement is taken too.
 FEWEST = 100
-# sd of a saturated value about zero, in rails.
-WIDTH = 2.0
+# Root mean square of what a gap lost (δ), in rails.
+WIDTH = 0.5
 
 
 class SignalPrior(eqx.Module):
@@ -92,10 +93,11 @@ def of_values(
     sample: Int[Array, "m"],
     channel: Int[Array, "m"],
     sign: Float[Array, "m"],
+    length: Float[Array, "m"],
 ) -> Known:
     """The prior of x = signal + sign·δ at some saturated values, all else of the signal being known.
 
-    sample, channel: where they lie; sign: zero pads (δ = 0, of no effect).
+    sample, channel: where they lie; sign: zero pads (δ = 0, of no effect); length: of the gap of each, in samples.
     """
     kernel = prior.kernel[channel]
     reach = prior.kernel.shape[1] - 1
@@ -105,12 +107,13 @@ def of_values(
     around = sample[:, None] + jnp.arange(-reach, reach + 1)[None]
     window = signal[jnp.clip(around, 0, len(signal) - 1), channel[:, None]]
     weights = jnp.concatenate([kernel[:, :0:-1], kernel], axis=1)
-    rail = jnp.abs(window[:, reach])
-    pull = 1.0 / (WIDTH * jnp.maximum(rail, 1e-9)) ** 2
+    rail = jnp.maximum(jnp.abs(window[:, reach]), 1e-9)
+    # Values of a gap go together: what is known of their mean must not be counted once for each.
+    pull = 1.0 / ((WIDTH * rail) ** 2 * jnp.maximum(length, 1.0))
     real = sign != 0.0
     precision = jnp.where(same & real[:, None] & real[None], values * sign[:, None] * sign[None], 0.0)
     precision = precision + jnp.diag(jnp.where(real, pull, 1.0))
-    slope = jnp.sum(weights * window, axis=1) + pull * window[:, reach]
+    slope = jnp.sum(weights * window, axis=1)
     return Known(precision, jnp.where(real, sign * slope, 0.0))
 
 

@@ -27,7 +27,8 @@ def whole_trial_cost(problem: SegmentProblem, delta: Float[np.ndarray, "m"]) -> 
         variance=jnp.broadcast_to(jnp.asarray(problem.variance), (count, 6)),
     )
     no_height = jnp.zeros(count, bool)
-    rows = Rows(jnp.asarray(problem.rest), jnp.asarray(problem.velocity_variance), no_height, jnp.ones(()))
+    speed = jnp.full(count, problem.velocity_variance)
+    rows = Rows(jnp.asarray(problem.rest), speed, no_height, jnp.ones(count))
     prior, gravity = jax.tree.map(jnp.asarray, problem.prior), jnp.asarray(problem.gravity)
     reference = strapdown(samples.signal, samples.period, prior, gravity)
     covariance = jnp.asarray(problem.prior_covariance)

@@ -76,7 +76,7 @@ def walking_trials(trials: int, count: int) -> WalkingTrials:
     speed = jnp.asarray(noise.rest_velocity_sd**2)
     no_height = jnp.zeros((trials, count), bool)
     rest = jnp.broadcast_to(jnp.asarray(truth.rest), (trials, count))
-    one = jnp.ones(trials)
+    one = jnp.ones((trials, count))
     return WalkingTrials(
         samples=samples,
         reference=jax.jit(jax.vmap(partial(strapdown, gravity=jnp.asarray(GRAVITY))))(
@@ -110,7 +110,7 @@ def linear_model(trials: WalkingTrials) -> LinearModel:
         Q=Q,
         root=root,
         H=H,
-        R=trials.rows.velocity_variance[0] * jnp.eye(3),
+        R=trials.rows.velocity_variance[0, 0] * jnp.eye(3),
         y=y,
         mask=mask,
         m0=jnp.zeros((count, 9)),
