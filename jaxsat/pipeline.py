@@ -58,8 +58,7 @@ class Estimate(eqx.Module):
     filled: Float[np.ndarray, "N 6"]
     """The recording's six channels with saturated values replaced (rad/s, m/s²)."""
     signal_sd: Float[np.ndarray, "N 6"]
-    """sd of each value of `filled`: sensor noise; where it was filled, by methods 1 and 2 that of a value anywhere
-    within its bounds, because they do not say more, by `map` that of its signal prior."""
+    """sd of each value of `filled`: sensor noise, and where it was filled `Fills.sd`."""
     fills: Fills
     standard_position: Float[np.ndarray, "N 3"]
     """Where the standard smoother, which ignores saturation, puts the sensor (m)."""
@@ -152,9 +151,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     standard, floor = _smooth(trial, config)
     smoothed = standard
     clock.lap("smoother")
-    compensated = False
     if config.method != "standard" and len(gaps):
-        compensated = True
         options = search_options(config, config.method)
         report = partial(progress, "segments")
         # An inequality acts on the whole trajectory only: a single segment is searched without it.
@@ -174,16 +171,16 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         clock.lap("smoother")
 
     n = len(recording)
-    fills = eqx.tree_at(
-        lambda f: (f.signal, f.variance, f.at_bound),
-        fills,
-        (fills.signal[:n], fills.variance[:n], fills.at_bound[:n]),
-    )
+
+    def sampled(f):
+        return f.signal, f.variance, f.sd, f.gap_sd, f.identified, f.at_bound
+
+    fills = eqx.tree_at(sampled, fills, [x[:n] for x in sampled(fills)])
     if floor is not None:
         floor = eqx.tree_at(lambda f: f.active, floor, floor.active[:n])
     offsets = np.concatenate([prepared.gyr_offset, np.zeros(3)])
     filled = np.where(prepared.sign != 0, fills.signal + offsets, recording.signal)
-    variance = trial.variance[:n] + (fills.variance if compensated else 0.0)
+    variance = trial.variance[:n] + fills.sd**2
     return Estimate(
         recording=recording,
         config=config,

@@ -65,16 +65,24 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
     Columns: `channel`, `start` and `end` (s, [start, end)), `rail` (the limit, signed; where the device flagged
     the gap and no limit is known, the extreme measured value), `peak` (extreme filled value, signed), `impulse`
     (time integral of what was added, rad or m/s), `status` (how the search of the gap's segment ended:
-    `converged`, `max_iterations`, `no_arrival` where no rest follows, or `ignored` by method standard).
-    `peak_sd`, `impulse_sd` and `identified` are empty: every method finds one best signal, not a distribution of
-    the whole gap, so none can say how well a gap is known.
+    `converged`, `max_iterations`, `no_arrival` where no rest follows, or `ignored` by method standard). Method map
+    says how well a gap is known: `peak_sd` of the extreme value, `impulse_sd`, and `identified`, the share of the
+    impulse's variance under the signal prior that the rests removed (0: the prior alone decides, 1: the rests do).
+    The other methods find one best signal, not a distribution, and leave these empty.
     """
     gaps, recording = estimate.gaps, estimate.recording
     period, added = recording.period, estimate.filled - recording.signal
     limits = np.stack([estimate.rails.low, estimate.rails.high])[(gaps.sign > 0).astype(int), gaps.channel]
     spans = list(zip(gaps.channel, gaps.start, gaps.end, strict=True))
     measured = np.array([_extreme(recording.signal[i:j, c]) for c, i, j in spans])
-    unknown = pd.array([pd.NA] * len(gaps), dtype="Float64")
+    fills = estimate.fills
+    first = (gaps.start, gaps.channel)
+    known = np.isfinite(fills.identified[first])
+    tops = [i + int(np.argmax(np.abs(estimate.filled[i:j, c]))) for c, i, j in spans]
+
+    def where_known(x) -> pd.Series:
+        return pd.Series(x, dtype="Float64").where(known)
+
     table = pd.DataFrame(
         {
             "channel": pd.array(np.array(CHANNELS)[gaps.channel], dtype="string"),
@@ -82,10 +90,10 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
             "end": recording.time[gaps.start] + period * (gaps.end - gaps.start),
             "rail": np.where(np.isfinite(limits), limits, measured),
             "peak": np.array([_extreme(estimate.filled[i:j, c]) for c, i, j in spans], float),
-            "peak_sd": unknown,
+            "peak_sd": where_known(estimate.signal_sd[tops, gaps.channel]),
             "impulse": np.array([added[i:j, c].sum() * period for c, i, j in spans], float),
-            "impulse_sd": unknown,
-            "identified": pd.array([pd.NA] * len(gaps), dtype="boolean"),
+            "impulse_sd": where_known(fills.gap_sd[first] * period),
+            "identified": where_known(fills.identified[first]),
             "status": pd.array(_status_words(estimate)[_segment_at(estimate, gaps.start)], dtype="string"),
         }
     )

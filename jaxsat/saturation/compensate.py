@@ -25,8 +25,9 @@ from jaxsat.saturation.layout import (
     padded_sizes,
 )
 from jaxsat.saturation.methods import Options, SegmentFill, solve_segment
-from jaxsat.saturation.prior import learn
+from jaxsat.saturation.prior import SignalPrior, learn
 from jaxsat.saturation.solvers import Status
+from jaxsat.saturation.uncertainty import Uncertainty, uncertainty
 from jaxsat.signals.rests import Segments
 
 Progress = Callable[[int, int], None]
@@ -44,6 +45,12 @@ class Fills(eqx.Module):
     """What a filled value adds to the sensor's noise."""
     bias: Float[np.ndarray, "6"]
     """Of the sensors (rad/s, m/s²); zero unless the method is `map`."""
+    sd: Float[np.ndarray, "N 6"]
+    """Of filled values: by `map` that of their posterior, by the others that of a value anywhere in its bounds."""
+    gap_sd: Float[np.ndarray, "N 6"]
+    """Of the sum over the gap that a filled value lies in; NaN where the method does not say."""
+    identified: Float[np.ndarray, "N 6"]
+    """Share of the variance of that sum that the rests removed; NaN where the method does not say."""
     at_bound: Bool[np.ndarray, "N 6"]
     """Values where the bound decided, not the data."""
     status: Int[np.ndarray, "S"]
@@ -60,12 +67,15 @@ class Fills(eqx.Module):
 
     @staticmethod
     def nothing(trial: Trial, count: int) -> "Fills":
-        zeros = np.zeros(count)
+        zeros, shape = np.zeros(count), trial.signal.shape
         return Fills(
             signal=np.array(trial.signal),
             variance=np.array(trial.unfilled_variance),
             bias=np.zeros(6),
-            at_bound=np.zeros(trial.signal.shape, bool),
+            sd=np.zeros(shape),
+            gap_sd=np.full(shape, np.nan),
+            identified=np.full(shape, np.nan),
+            at_bound=np.zeros(shape, bool),
             status=np.full(count, int(Status.NOTHING_TO_DO)),
             cost_before=zeros,
             cost_after=zeros.copy(),
@@ -86,6 +96,7 @@ class Fills(eqx.Module):
             + trial.sign[sample, channel] * found.delta[real]
         )
         self.variance[sample, channel] = found.variance[real]
+        self.sd[sample, channel] = np.sqrt(found.variance[real])
         self.at_bound[sample, channel] = found.at_bound[real]
         self.status[segments] = found.solution.status
         self.cost_before[segments], self.cost_after[segments] = found.cost_before, found.solution.value
@@ -93,6 +104,13 @@ class Fills(eqx.Module):
             found.solution.residual,
             found.solution.iterations,
         )
+
+    def record_uncertainty(self, found: Uncertainty, values: Values) -> None:
+        found, values = jax.tree.map(np.asarray, (found, values))
+        real = values.sample < len(self.signal)
+        at = values.sample[real], values.channel[real]
+        self.sd[at], self.gap_sd[at] = found.sd[real], found.gap_sd[real]
+        self.identified[at] = found.identified[real]
 
 
 def filter_trial(
@@ -118,17 +136,39 @@ def solve_segments(
     options: Options,
 ) -> tuple[SegmentFill, Values]:
     """Some segments of a recording side by side, from the filtered states at their departures."""
-    prior = None
-    if options.method == "map":
-        moving = ~jnp.asarray(trial.rows.rest)
-        signal, sign, clean = map(jnp.asarray, (trial.signal, trial.sign, trial.clean))
-        prior = learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0])
+    prior = _signal_prior(trial) if options.method == "map" else None
 
     def solve(state, covariance, table, departure, arrival):
         segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
         return solve_segment(segment, jnp.asarray(trial.gravity), options), values
 
     return jax.vmap(solve)(states, covariances, table, departure, arrival)
+
+
+def judge_segments(
+    trial: Trial,
+    states: NavState,
+    covariances: Float[Arrays, "L s s"],
+    table: Float[Arrays, "L 10 10"],
+    departure: Int[Arrays, "L"],
+    arrival: Int[Arrays, "L"],
+    delta: Float[Arrays, "L m"],
+    sizes: Sizes,
+) -> tuple[Uncertainty, Values]:
+    """How well what `map` found for them is known; the arguments of `solve_segments`, and its δ."""
+    prior = _signal_prior(trial)
+
+    def judge(state, covariance, table, departure, arrival, delta):
+        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
+        return uncertainty(segment, delta, jnp.asarray(trial.gravity)), values
+
+    return jax.vmap(judge)(states, covariances, table, departure, arrival, delta)
+
+
+def _signal_prior(trial: Trial) -> SignalPrior:
+    moving = ~jnp.asarray(trial.rows.rest)
+    signal, sign, clean = map(jnp.asarray, (trial.signal, trial.sign, trial.clean))
+    return learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0])
 
 
 def trial_biases(
@@ -148,6 +188,7 @@ def trial_biases(
 _bias = eqx.filter_jit(trial_biases)
 _filter = eqx.filter_jit(filter_trial)
 _solve = eqx.filter_jit(solve_segments)
+_judge = eqx.filter_jit(judge_segments)
 
 
 @eqx.filter_jit
@@ -171,14 +212,17 @@ def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 1
 
 
 def _solve_some(
-    trial, departures, table, segments: Segments, mine, sizes: Sizes, options, fills: Fills
+    trial, departures, table, segments: Segments, mine, sizes: Sizes, options, fills: Fills, last: bool
 ) -> None:
-    """Solve the segments `mine`, padded to a bucket of lanes, and record them."""
+    """Solve the segments `mine`, padded to a bucket of lanes, and record them; judge them if nothing follows."""
     lanes = bucket(len(mine), 1)
     given = (departures, table[mine], segments.departure[mine], segments.arrival[mine])
     (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x, lanes), given)
     found, values = _solve(trial, states, covariances, table, departure, arrival, sizes, options)
     fills.record(trial, mine, found, values)
+    if last and options.method == "map":
+        judged = _judge(trial, states, covariances, table, departure, arrival, found.delta, sizes)
+        fills.record_uncertainty(*judged)
 
 
 def compensate_parallel(
@@ -189,14 +233,16 @@ def compensate_parallel(
     table = arrival_table(trial, segments)
     chunks = list(_chunks(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
-    for _ in range(sweeps):
+    for sweep in range(sweeps):
         filtered = _filter(trial, fills.unbiased, fills.variance)
         filtered = jax.tree.map(np.asarray, filtered)
         shifted = eqx.tree_at(lambda t: t.signal, trial, trial.signal - fills.bias[None])
         for mine, sizes in chunks:
             at = np.maximum(segments.departure[mine], 0)
             departures = jax.tree.map(lambda x, at=at: x[at], filtered)
-            _solve_some(shifted, departures, table, segments, mine, sizes, options, fills)
+            _solve_some(
+                shifted, departures, table, segments, mine, sizes, options, fills, sweep == sweeps - 1
+            )
             done += len(mine)
             if progress:
                 progress(done, sweeps * total)
@@ -233,7 +279,7 @@ def compensate_sequential(
         state, covariance = _filter_to(trial, fills, state, covariance, at, departure)
         at = departure
         here = jax.tree.map(lambda x: np.asarray(x)[None], (state, covariance))
-        _solve_some(trial, here, table, segments, np.array([index]), sizes, options, fills)
+        _solve_some(trial, here, table, segments, np.array([index]), sizes, options, fills, True)
         if progress:
             progress(count + 1, len(busy))
     return fills
