@@ -21,8 +21,9 @@ class _Section(BaseModel):
 class Noise(_Section):
     """Noise of the sensors as densities, with what no model of them says (scale, axes), and how still a rest is.
 
-    Their ratios are those with the least mean position RMSE of `standard` on the 14 PyShoe trials that do not saturate
-    (`other` and `clip` of its splits), their size the one at which J* there is about half of its number of rows.
+    Chosen on recordings that do not saturate: the 14 such PyShoe trials, of which the position RMSE of `standard` is
+    least at densities of a tenth of `rest_velocity_sd`, and the gaitmap walk, which wants an accelerometer five times
+    noisier. Their common size is such that J* is about half of its number of rows.
     """
 
     gyr_density: float = Field(default=2e-3, gt=0, description="angular-rate noise density (rad/s/√Hz)")
@@ -87,10 +88,10 @@ class Smoother(_Section):
         default="first_rest", description="constant rate to remove"
     )
     gyr_bias_sd: float = Field(
-        default=1e-3, gt=0, description="sd of the rate bias that is left, for the method map (rad/s)"
+        default=0.0, ge=0, description="sd of the rate bias that map estimates (rad/s); 0: none"
     )
     acc_bias_sd: float = Field(
-        default=0.05, gt=0, description="sd of the accelerometer's bias, for the method map (m/s²)"
+        default=0.0, ge=0, description="sd of the accelerometer's bias that map estimates (m/s²); 0: none"
     )
 
 

@@ -132,13 +132,16 @@ def prepare(recording: Recording, config: Config) -> Prepared:
 def search_options(config: Config, method: str) -> Options:
     """How a compensating method searches."""
     chosen = config.saturation
+    bias_sd = np.repeat([config.smoother.gyr_bias_sd, config.smoother.acc_bias_sd], 3)
+    # A sensor of which no bias is wanted has one that is as good as known.
+    wanted = method == "map" and bool(bias_sd.any())
     return Options(
         cast(Compensation, method),
         chosen.solver,
         chosen.free_peak_time,
         jnp.asarray(chosen.max_iterations),
         jnp.asarray(chosen.tolerance),
-        jnp.repeat(jnp.array([config.smoother.gyr_bias_sd, config.smoother.acc_bias_sd]), 3),
+        jnp.asarray(np.maximum(bias_sd, 1e-9)) if wanted else None,
     )
 
 

@@ -44,7 +44,7 @@ class Fills(eqx.Module):
     variance: Float[np.ndarray, "N 6"]
     """What a filled value adds to the sensor's noise."""
     bias: Float[np.ndarray, "6"]
-    """Of the sensors (rad/s, m/s²); zero unless the method is `map`."""
+    """Of the sensors (rad/s, m/s²); zero where they are not estimated."""
     sd: Float[np.ndarray, "N 6"]
     """Of filled values: by `map` that of their posterior, by the others that of a value anywhere in its bounds."""
     gap_sd: Float[np.ndarray, "N 6"]
@@ -246,7 +246,7 @@ def compensate_parallel(
             done += len(mine)
             if progress:
                 progress(done, sweeps * total)
-        if options.method == "map":
+        if options.bias_sd is not None:
             bias = _bias(trial, fills.signal, fills.variance, options.bias_sd, fills.bias)
             fills = replace(fills, bias=np.asarray(bias))
     return fills

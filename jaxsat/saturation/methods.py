@@ -95,8 +95,8 @@ class Options(eqx.Module):
     free_peak_time: bool = eqx.field(static=True)
     max_iterations: Int[Array, ""]
     tolerance: Float[Array, ""]
-    bias_sd: Float[Array, "6"]
-    """Of the sensors' biases, which `map` estimates."""
+    bias_sd: Float[Array, "6"] | None
+    """Of the sensors' biases; None where they are not estimated."""
 
 
 def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options) -> SegmentFill:

@@ -183,7 +183,7 @@ def score(
             way = sign.at[place].get(mode="fill", fill_value=0)
             filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")
             extra = unfilled.at[place].set(fill.variance, mode="drop")
-            if option.method == "map":
+            if option.bias_sd is not None:
                 # A recording that does not saturate is left as it is.
                 moved = trial_biases(trial, filled, extra, option.bias_sd, bias)
                 bias = jnp.where(jnp.any(sign != 0), moved, 0.0)
