@@ -1,5 +1,7 @@
 """The other way through the house: a recording and a configuration in, an attitude out, rests or not."""
 
+from collections.abc import Iterator
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -115,18 +117,10 @@ def orient(recording: Recording, config: Config | None = None) -> Orientation:
             q_nb, sd = _smooth(Samples(rates, padded[1], variance), start, rest, config, moving)
         angles = _angles(q_nb)
     n, gaps = len(recording), find_gaps(sign)
-    long = int(np.sum((gaps.end - gaps.start)[gaps.channel < 3] > LONG_GAP / period))
-    if long and settings.fill == "interpolate":
-        warnings.append(
-            f"{recording.name}: {long} gaps in the rates last longer than {LONG_GAP:g} s: what fills them is a "
-            "guess, and the attitude after them may be far off."
-        )
-    if sd is not None and np.any(lost := sd[:, 0] > LOST):
-        warnings.append(
-            f"{recording.name}: for {lost.mean():.0%} of the time the inclination is known no better than "
-            f"{np.rad2deg(LOST):.0f} deg (largest sd {np.rad2deg(sd[:, 0].max()):.0f} deg): too much was lost to "
-            "rely on it there."
-        )
+    if settings.fill == "interpolate":
+        warnings += _long_gaps(recording, gaps)
+    if sd is not None:
+        warnings += _lost(recording, sd)
     q_nb = np.asarray(q_nb)
     return Orientation(
         recording=recording,
@@ -144,6 +138,24 @@ def orient(recording: Recording, config: Config | None = None) -> Orientation:
         filled=filled,
         warnings=warnings,
     )
+
+
+def _long_gaps(recording: Recording, gaps: Gaps) -> Iterator[str]:
+    long = int(np.sum((gaps.end - gaps.start)[gaps.channel < 3] > LONG_GAP / recording.period))
+    if long:
+        yield (
+            f"{recording.name}: {long} gaps in the rates last longer than {LONG_GAP:g} s: what fills them is a "
+            "guess, and the attitude after them may be far off."
+        )
+
+
+def _lost(recording: Recording, sd: Float[np.ndarray, "N 2"]) -> Iterator[str]:
+    lost, largest = float(np.mean(sd[:, 0] > LOST)), np.rad2deg(sd[:, 0].max())
+    if lost > 0.0:
+        yield (
+            f"{recording.name}: for {lost:.0%} of the time the inclination is known no better than "
+            f"{np.rad2deg(LOST):.0f} deg (largest sd {largest:.0f} deg): too much was lost to rely on it there."
+        )
 
 
 def _check_sensors(recording: Recording) -> None:

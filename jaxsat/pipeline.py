@@ -26,12 +26,12 @@ from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import Segments, find_rests, find_segments
 from jaxsat.signals.support import find_support
 
-# What a recording did up to so long before its first rest is integrated backwards by the gyroscope alone.
+# Up to so long before its first rest (s) a recording's tilt is as well known as in it.
 LATEST_FIRST_REST = 1.0
 # A gyroscope offset is taken from a first rest of at least this length; a shorter one tells less than it costs.
 SHORTEST_OFFSET_REST = 1.0
-# sd of the unknown velocity of a sensor that does not start at rest (m/s), and of its tilt (rad) however long it
-# moves before its first rest.
+# sd of the unknown velocity of a sensor that does not start at rest (m/s), and of its tilt (rad), however long it
+# moves before its first rest: the PI controller knows it no worse on the trials of results/orientation.
 MOVING_START_SD = 3.0
 MOVING_START_TILT_SD = 0.05
 
@@ -260,15 +260,17 @@ def _trial(
     density = np.repeat([noise.gyr_density, noise.acc_density], 3)
     variance = np.where(recording.missing, np.maximum(signal.var(axis=0), density**2 / T), density**2 / T)
 
-    # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, where that
-    # is long by the PI controller of `orientation`, which bounds what the gyroscope's offset does until then.
+    # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
+    # controller of `orientation` where that is so long that its offset would do more than the controller errs.
     q_nb = quat_between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
     velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
+    drifted = (config.smoother.gyr_bias_sd * first * T) ** 2 + noise.gyr_density**2 * first * T
     if first * T > LATEST_FIRST_REST:
-        trusted = ((sign[:first] == 0) & ~recording.missing[:first]).reshape(first, 2, 3).all(axis=2)
-        q_nb = _attitude_before(signal[:first], trusted, T, Start(q_nb, jnp.zeros(3), gravity), config)
-        drifted = (config.smoother.gyr_bias_sd * first * T) ** 2 + noise.gyr_density**2 * first * T
         tilt += min(drifted, MOVING_START_TILT_SD**2)
+    if drifted > MOVING_START_TILT_SD**2:
+        trusted = ((sign[:first] == 0) & ~recording.missing[:first]).reshape(first, 2, 3).all(axis=2)
+        start = Start(q_nb, jnp.zeros(3), jnp.asarray(float(gravity)))
+        q_nb = _attitude_before(signal[:first], trusted, T, start, config)
     elif first > 0:
         early = prefixes(sample_intervals(jnp.asarray(signal[:first]), jnp.full(first, T)))
         q_nb = quat_multiply(q_nb, quat_conjugate(early.rotation[-1]))

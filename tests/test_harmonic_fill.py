@@ -37,3 +37,16 @@ def test_a_fill_without_saturation_changes_nothing_and_with_too_much_is_refused(
     assert (fill_harmonic(measured, 0 * sign).signal == measured).all()
     with pytest.raises(InputError, match="too few"):
         fill_harmonic(measured, np.ones_like(sign))
+
+
+def test_long_recordings_are_filled_where_they_saturate():
+    """Two seconds of a hundred saturate: most windows are left out, and the fill is as good."""
+    true, cut, sign = clipped(100.0)
+    time = np.arange(len(true)) / 100
+    brief = (time > 40) & (time < 42)
+    found = fill_harmonic(np.where(brief, cut, true), np.where(brief, sign, 0))
+    gap = brief & (sign != 0)
+    assert gap.sum() > 50 and (found.signal == true)[~gap].all()
+    error = np.sqrt(np.mean((found.signal - true)[gap] ** 2))
+    assert error < 0.15 * np.sqrt(np.mean((cut - true)[gap] ** 2)) + 0.02
+    assert np.mean(np.abs(found.signal - true)[gap] < 1.96 * found.sd[gap]) > 0.8
