@@ -314,7 +314,8 @@ def _references(
     middle = time[::step] + 0.5 * (step - 1) * period
     x, at_blocks = references(frequency, middle, gain)
     _, z = references(frequency, time, gain)
-    return x * jnp.concatenate([blur, blur, jnp.ones(1)]), z * kept, at_blocks * kept
+    blur = jnp.concatenate([blur, blur, jnp.ones(1)])
+    return x * blur[None], z * kept[None], at_blocks * kept[None]
 
 
 @jax.jit

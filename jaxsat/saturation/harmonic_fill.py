@@ -16,7 +16,7 @@ from jaxsat.inertial.windows import Windows, harmonics, neighbours, periodogram
 
 SAMPLES = 256
 """Length of the stretches that are filled together; as many weights as samples."""
-CLEAN = 16
+CLEAN = 8
 ITERATIONS = 12
 DAMPING = 0.7
 

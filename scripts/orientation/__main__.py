@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=TABLES, default=TABLES)
     parser.add_argument("-o", "--output", type=Path, default=Path("results/orientation"))
     parser.add_argument(
-        "--keep-peers", action="store_true", help="other packages in broad.csv stand as they are"
+        "--again", nargs="*", default=(), help="filters of broad.csv to run anew, not all", metavar="NAME"
     )
     arguments = parser.parse_args()
     c, out = tomllib.loads(CONFIG.read_text()), arguments.output
@@ -41,8 +41,8 @@ def main() -> None:
     }
     for name in (name for name in TABLES if name in arguments.only):
         if name == "broad":
-            kept = pd.read_csv(out / "broad.csv") if arguments.keep_peers else None
-            table = broad_table(c, arguments.data, pd.read_csv(out / "tuning.csv"), kept)
+            former = pd.read_csv(out / "broad.csv") if arguments.again else None
+            table = broad_table(c, arguments.data, pd.read_csv(out / "tuning.csv"), arguments.again, former)
         else:
             table = makers[name](c, arguments.data)
         table.round(6).to_csv(out / f"{name}.csv", index=False)

@@ -1,5 +1,6 @@
 """Real motion against optical tracking, beside the filters of others."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ Known = dict[tuple[str, str], Any]
 """Errors (deg) by filter and trial."""
 
 
-def broad_table(c: dict, data: Path, tuned: Table, kept: Table | None = None) -> Table:
-    """kept: a former table, whose rows of other packages stand."""
+def broad_table(
+    c: dict, data: Path, tuned: Table, again: Sequence[str] = (), former: Table | None = None
+) -> Table:
+    """again: filters of this package that are run anew, all others standing as they are in a former table."""
     b = c["broad"]
     trials = {name: load_trial(data / "broad" / f"{name}.npz") for name in (*b["train"], *b["test"])}
     training, known = {name: trials[name] for name in b["train"]}, {}
@@ -29,10 +32,10 @@ def broad_table(c: dict, data: Path, tuned: Table, kept: Table | None = None) ->
         "jaxsat gyro": partial(ours, estimate="gyro"),
         "jaxsat gyro_accel": partial(ours, estimate="gyro_accel"),
         "jaxsat pi": partial(ours, estimate="pi"),
-        "jaxsat pi, Q_comp": partial(ours, estimate="pi", update="comp"),
-        "jaxsat pi, Q_imp": partial(ours, estimate="pi", update="imp"),
+        "jaxsat pi, Q_comp": partial(ours, **alone, update="comp"),
+        "jaxsat pi, Q_imp": partial(ours, **alone, update="imp"),
         "jaxsat pi, integral alone": partial(ours, **alone),
-        "jaxsat pi, gate 1 m/s²": partial(ours, estimate="pi", gate=1.0),
+        "jaxsat pi, gate 1 m/s²": partial(ours, **alone, gate=1.0),
         "jaxsat pi, tau 0, ki 0": partial(ours, **alone, tau=0.0, ki=0.0),
         "jaxsat pi, Eq. 11, tau 0": partial(ours, **paper_form),
         "jaxsat pi, Eq. 11, tau 0, gate 1 m/s²": partial(ours, **paper_form, gate=1.0),
@@ -40,9 +43,12 @@ def broad_table(c: dict, data: Path, tuned: Table, kept: Table | None = None) ->
         "jaxsat pi, by gradient": partial(ours, **alone, **gradient),
         "jaxsat smoothed": ours,
     }
-    if kept is None:
+    if former is None:
         runs |= _peers(b, training, known)
-    rows = [] if kept is None else kept[~kept["filter"].str.startswith("jaxsat")].to_dict("records")
+        rows = []
+    else:
+        runs = {label: runs[label] for label in again}
+        rows = former[~former["filter"].isin(runs)].to_dict("records")
     for label, run in runs.items():
         for name, trial in trials.items():
             found = errors_of(label, run, name, trial, known)
