@@ -115,6 +115,10 @@ class Orientation(_Section):
         default="none", description="how far |a| may be from g before it is not believed (m/s²)"
     )
     limit: float = Field(default=0.05, gt=0, description="largest rate that the integral term adds (rad/s)")
+    offset: Literal["rests", "integral"] = Field(
+        default="rests",
+        description="what follows the gyroscope's offset: its reading at rests too, or the integral term alone",
+    )
     fill: Literal["interpolate", "none"] = Field(
         default="interpolate", description="what becomes of saturated rates"
     )

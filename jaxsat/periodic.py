@@ -14,7 +14,7 @@ from jaxsat.config import Config
 from jaxsat.errors import InputError
 from jaxsat.inertial.filters import Filter, butterworth
 from jaxsat.inertial.harmonic import Spectrum, learn, least_squares, predict, recursive
-from jaxsat.inertial.periodic import bmflc, chain_response, compensated, integrated, phases, wflc
+from jaxsat.inertial.periodic import bmflc, chain_response, integrated, references, wflc
 from jaxsat.inertial.windows import Windows, neighbours, periodogram
 from jaxsat.saturation.harmonic_fill import fill_harmonic
 from jaxsat.signals.checks import check_form, check_wraps
@@ -25,6 +25,8 @@ from jaxsat.signals.support import find_band, find_support, measured_sensors
 
 # Weights of a window: its length is what so many can describe up to the band's end.
 MOST_WEIGHTS = 256
+# Least squares sees means of blocks, so many a period of the highest frequency at least: what is faster is noise.
+BLOCKS = 16
 LEARNING_WINDOWS, LEARNING_ITERATIONS = 6, 8
 # An angle beyond which the sensor's axes can no longer be called fixed (rad).
 LARGE_ANGLE = 0.3
@@ -92,12 +94,12 @@ def _estimate(recording: Recording, config: Config) -> PeriodicEstimate:
     filled, signal_sd = _fill(recording, sign, bands)
     motion = np.zeros((len(recording), 6))
     sd: np.ndarray | None = np.zeros((len(recording), 6))
-    offset = np.array([np.zeros(3), filled[:, 3:].mean(axis=0)])
+    gravity = filled[:, 3:].mean(axis=0)
     for sensor, (low, high) in bands.items():  # the gyroscope first
         columns = COLUMNS[sensor]
         signal = filled[:, columns]
         if sensor == "acc" and "gyr" in bands:
-            signal = signal + np.cross(motion[:, :3], offset[1])
+            signal = signal + np.cross(motion[:, :3], gravity)
         noise = np.array([_noise_variance(axis, recording.period, high) for axis in signal.T])
         # Weight of each value beside a measured one: 0 where missing, less where filled.
         certainty = noise / (noise + signal_sd[:, columns] ** 2)
@@ -249,13 +251,23 @@ def _in_windows(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Regularised least squares on every frequency from 0 to beyond the band; those below it are no motion."""
     top = min(1.25 * high, 0.49 / period)
-    length = min(len(signal), int(MOST_WEIGHTS / (4 * top * period)))
-    windows = Windows.cut(len(signal), length)
-    spacing = 1 / (2 * length * period)
+    step = max(1, int(1 / (BLOCKS * top * period)))
+    blocks = -(-len(signal) // step)
+    length = min(blocks, int(MOST_WEIGHTS / (4 * top * step * period)))
+    windows = Windows.cut(blocks, length)
+    whole = Windows(windows.start * step, length * step, blocks * step)
+    spacing = 1 / (2 * length * step * period)
     frequency = spacing * np.arange(1, int(top / spacing) + 1)
     inside = (frequency >= low - spacing / 2) & (frequency <= high + spacing / 2)
-    x, z = _references(
-        jnp.asarray(frequency), jnp.asarray(inside), jnp.asarray(np.arange(length) * period), order, sensor
+    time = np.arange(length * step) * period
+    x, z, coarse_z = _references(
+        jnp.asarray(frequency),
+        jnp.asarray(inside),
+        jnp.asarray(time),
+        jnp.asarray(period),
+        order,
+        sensor,
+        step,
     )
     group = jnp.asarray(neighbours(len(frequency), 2))
     few = np.unique(np.linspace(0, len(windows.start) - 1, LEARNING_WINDOWS).astype(int))
@@ -264,37 +276,55 @@ def _in_windows(
         if not m.any() or np.ptp(s) == 0:
             continue
         scale, offset = s.std(), s.mean()
-        rows, weights = windows.of((s - offset) / scale), windows.of(m)
-        power = periodogram(rows, frequency * period)
+        mean_of, share = _block_means((s - offset) / scale, m, step)
+        rows, weights = windows.of(mean_of), windows.of(share)
+        power = periodogram(rows, frequency * step * period)
         start = Spectrum(jnp.asarray(np.concatenate([power, power, [1.0]])), jnp.asarray(0.01))
         mean, variance = _windowed(
-            jnp.asarray(rows), jnp.asarray(weights), jnp.asarray(few), x, z, group, start
+            jnp.asarray(rows), jnp.asarray(weights), jnp.asarray(few), x, z, coarse_z, group, start
         )
-        motion[:, axis] = scale * windows.joined(np.asarray(mean))
-        sd[:, axis] = scale * windows.joined(np.sqrt(np.asarray(variance)))
+        motion[:, axis] = scale * whole.joined(np.asarray(mean))[: len(signal)]
+        spread = np.repeat(windows.joined(np.sqrt(np.asarray(variance))), step)
+        sd[:, axis] = scale * spread[: len(signal)]
     return motion, sd
 
 
-@partial(jax.jit, static_argnames="order")
+def _block_means(
+    signal: Float[np.ndarray, "N"], weight: Float[np.ndarray, "N"], step: int
+) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
+    """Weighted means of blocks of `step` samples, and their mean weights; the last block may lack some."""
+    extra = (0, -len(signal) % step)
+    s, m = (np.pad(x, extra).reshape(-1, step) for x in (signal, weight))
+    total = m.sum(axis=1)
+    return (s * m).sum(axis=1) / np.where(total > 0, total, 1.0), total / step
+
+
+@partial(jax.jit, static_argnames=("order", "step"))
 def _references(
-    frequency: Float[Array, "F"], inside: Bool[Array, "F"], time: Float[Array, "N"], order: int,
-    sensor: tuple[Filter, ...],
-) -> tuple[Float[Array, "N W"], Float[Array, "N W"]]:  # fmt: skip
-    """Reference inputs of signal and motion, with a constant that is no motion at the end."""
+    frequency: Float[Array, "F"], inside: Bool[Array, "F"], time: Float[Array, "N"], period: Float[Array, ""],
+    order: int, sensor: tuple[Filter, ...], step: int = 1,
+) -> tuple[Float[Array, "B W"], Float[Array, "N W"], Float[Array, "B W"]]:  # fmt: skip
+    """Reference inputs of block means, of the motion, and of the motion in the middle of each block.
+
+    A sinusoid's mean over a block is its value in the middle times sin(πfDT)/(D sin(πfT)).
+    """
     gain = chain_response(sensor, order, frequency)
-    angle, one = phases(frequency, time), jnp.ones((len(time), 1))
-    x = jnp.concatenate([compensated(angle, jnp.ones_like(gain)), one], axis=1)
-    kept = jnp.concatenate([inside, inside, jnp.zeros(1, bool)])
-    z = jnp.concatenate([compensated(angle, gain), 0 * one], axis=1)
-    return x, jnp.where(kept[None, :], z, 0.0)
+    kept = jnp.concatenate([inside, inside, jnp.zeros(1, bool)]).astype(time.dtype)
+    blur = jnp.sin(jnp.pi * frequency * step * period) / (step * jnp.sin(jnp.pi * frequency * period))
+    middle = time[::step] + 0.5 * (step - 1) * period
+    x, at_blocks = references(frequency, middle, gain)
+    _, z = references(frequency, time, gain)
+    blur = jnp.concatenate([blur, blur, jnp.ones(1)])
+    return x * blur[None], z * kept[None], at_blocks * kept[None]
 
 
 @jax.jit
-def _windowed(rows, weights, few, x, z, group, start):
+def _windowed(rows, weights, few, x, z, coarse_z, group, start):
     spectrum = learn(rows[few], weights[few], x, group, start, LEARNING_ITERATIONS)
 
     def one(row):
-        return predict(least_squares(row[0], row[1], x, spectrum), z)
+        fit = least_squares(row[0], row[1], x, spectrum)
+        return z @ fit.weights, predict(fit, coarse_z)[1]
 
     return jax.lax.map(one, (rows, weights))
 
@@ -309,7 +339,9 @@ def _recursive(
     frequency = np.concatenate([below, np.linspace(low, high, count)])
     inside = frequency >= low - 1e-9
     time = jnp.asarray(np.arange(len(signal)) * period)
-    x, z = _references(jnp.asarray(frequency), jnp.asarray(inside), time, order, sensor)
+    x, z, _ = _references(
+        jnp.asarray(frequency), jnp.asarray(inside), time, jnp.asarray(period), order, sensor
+    )
     motion, sd = np.zeros_like(signal), np.zeros_like(signal)
     for axis, (s, m) in enumerate(zip(signal.T, weight.T, strict=True)):
         if not m.any() or np.ptp(s) == 0:

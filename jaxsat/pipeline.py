@@ -9,10 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
 from jaxsat.errors import InputError
+from jaxsat.inertial.orientation import Gains, Start, backward
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
 from jaxsat.inertial.smoother import ActiveSet, Rows, Smoothed, smooth, smooth_nonnegative
 from jaxsat.inertial.strapdown import NavState, Samples, prefixes, sample_intervals
@@ -23,13 +24,16 @@ from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import Segments, find_rests, find_segments
+from jaxsat.signals.support import find_support
 
-# A recording may start up to so long before its first rest; what it did until then is integrated backwards.
+# Up to so long before its first rest (s) a recording's tilt is as well known as in it.
 LATEST_FIRST_REST = 1.0
 # A gyroscope offset is taken from a first rest of at least this length; a shorter one tells less than it costs.
 SHORTEST_OFFSET_REST = 1.0
-# sd of the unknown velocity of a sensor that does not start at rest (m/s).
+# sd of the unknown velocity of a sensor that does not start at rest (m/s), and of its tilt (rad), however long it
+# moves before its first rest: the PI controller knows it no worse on the trials of results/orientation.
 MOVING_START_SD = 3.0
+MOVING_START_TILT_SD = 0.05
 
 
 class Trajectory(eqx.Module):
@@ -88,7 +92,7 @@ def estimate(
     """Reconstruct the trajectory of a recording, saturated or not.
 
     Computed in float64 whatever JAX's setting. Raises `InputError` where the recording cannot give a
-    trajectory: no gyroscope, no rest at its start, units that cannot be.
+    trajectory: no gyroscope, no rest at all, units that cannot be.
     """
     config = config or Config()
     with jax.enable_x64(True):
@@ -232,11 +236,10 @@ def _trial(
     """The recording as the smoother wants it, and the gyroscope offset that was taken off (rad/s)."""
     n, T, signal = len(recording), recording.period, recording.signal
     started = np.flatnonzero(rest)
-    if not len(started) or started[0] * T > LATEST_FIRST_REST:
-        when = f"only at {started[0] * T:.1f} s" if len(started) else "nowhere"
+    if not len(started):
         raise InputError(
-            f"{recording.name}: no rest at the start (the sensor rests {when}); start recordings with the "
-            f"sensor still, cut what comes before the first rest, or give a rest column."
+            f"{recording.name}: no rest is found, and without any a trajectory drifts away within seconds; give a "
+            f"rest column if the sensor does rest. As it is, {find_support(recording, rest).sentence()}."
         )
     first = int(started[0])
     moving = np.flatnonzero(~rest[first:])
@@ -257,13 +260,20 @@ def _trial(
     density = np.repeat([noise.gyr_density, noise.acc_density], 3)
     variance = np.where(recording.missing, np.maximum(signal.var(axis=0), density**2 / T), density**2 / T)
 
-    # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope.
+    # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
+    # controller of `orientation` where that is so long that its offset would do more than the controller errs.
     q_nb = quat_between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
-    velocity = jnp.zeros(3)
-    if first > 0:
+    velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
+    drifted = (config.smoother.gyr_bias_sd * first * T) ** 2 + noise.gyr_density**2 * first * T
+    if first * T > LATEST_FIRST_REST:
+        tilt += min(drifted, MOVING_START_TILT_SD**2)
+    if drifted > MOVING_START_TILT_SD**2:
+        trusted = ((sign[:first] == 0) & ~recording.missing[:first]).reshape(first, 2, 3).all(axis=2)
+        start = Start(q_nb, jnp.zeros(3), jnp.asarray(float(gravity)))
+        q_nb = _attitude_before(signal[:first], trusted, T, start, config)
+    elif first > 0:
         early = prefixes(sample_intervals(jnp.asarray(signal[:first]), jnp.full(first, T)))
         q_nb = quat_multiply(q_nb, quat_conjugate(early.rotation[-1]))
-    tilt = noise.initial_tilt_sd**2
     speed = MOVING_START_SD**2 if first > 0 else noise.rest_velocity_sd**2
     # Tilt is horizontal in the navigation frame; heading and position are the origin of the map.
     prior_covariance = np.diag([tilt, tilt, 0.0, 0.0, 0.0, 0.0, speed, speed, speed])
@@ -292,6 +302,25 @@ def _trial(
         gravity=np.asarray(gravity),
     )
     return trial.padded(), offset
+
+
+def _attitude_before(signal, trusted, period: float, rest: Start, config: Config) -> Float[Array, "4"]:
+    """Attitude at the first of the samples before a rest."""
+    # Blank samples before the first turn nothing; lengths that are about the same share a program.
+    blank = ((-len(signal) % 4096, 0), (0, 0))
+    periods = np.pad(np.full(len(signal), period), blank[0])
+    gains = given_gains(config)
+    return _backward(np.pad(signal, blank), periods, np.pad(trusted, blank), rest, gains).q_nb[0]
+
+
+_backward = eqx.filter_jit(backward)
+
+
+def given_gains(config: Config) -> Gains:
+    """The gains of `config.orientation`, as numbers of JAX."""
+    s = config.orientation
+    gate = np.inf if s.gate == "none" else s.gate
+    return Gains(*(jnp.asarray(x, float) for x in (s.kp, s.ki, s.tau, gate, s.limit)))
 
 
 def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:

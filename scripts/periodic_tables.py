@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from jaxsat.config import load_config
 from jaxsat.inertial.filters import apply, butterworth, response
 from jaxsat.inertial.harmonic import Spectrum, least_squares, predict, recursive
-from jaxsat.inertial.periodic import analytical, band, chain_response, compensated, latt_bmflc, phases
+from jaxsat.inertial.periodic import analytical, band, chain_response, latt_bmflc, references
 from jaxsat.periodic import estimate_periodic
 from jaxsat.saturation.harmonic_fill import fill_harmonic
 from jaxsat.signals.readers import read
@@ -73,11 +73,7 @@ def errors(key, config, rate, order, mu, frequency, highpass, lowpass, samples):
     """Error of every method at each sample."""
     time, read_out, truth = simulated(key, config, rate, order, lowpass, samples)
     by_analysis = analytical(read_out, time, frequency, order, mu).motion
-    gain = chain_response(lowpass, order, frequency)
-    angle = phases(frequency, time)
-    offset = jnp.ones((samples, 1))
-    x = jnp.concatenate([compensated(angle, jnp.ones_like(gain)), offset], axis=1)
-    z = jnp.concatenate([compensated(angle, gain), 0 * offset], axis=1)
+    x, z = references(frequency, time, chain_response(lowpass, order, frequency))
     # Nothing is known beforehand: sines of up to ten times the signal, an offset of up to 100 m/s².
     weights = 2 * len(frequency)
     prior = jnp.concatenate([jnp.full(weights, 4.0), jnp.full(1, 1e4)])

@@ -313,11 +313,6 @@ def badly_scaled(table: pd.DataFrame) -> pd.DataFrame:
 
 
 @_table()
-def starts_in_motion(table: pd.DataFrame) -> pd.DataFrame:
-    return table[table.time > 1.3]
-
-
-@_table()
 def too_short(table: pd.DataFrame) -> pd.DataFrame:
     return table[table.time < 0.4]
 

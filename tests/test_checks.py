@@ -82,7 +82,6 @@ SAYS = {
     "gyr_not_in_degrees": ("--gyr-unit rad/s",),
     "swapped_sensors": ("swap",),
     "gravity_removed": ("gravity",),
-    "starts_in_motion": ("first 0.2 s",),
     "stuck_channel": ("gyr_x", "never changes"),
     "integer_overflow": ("gyr_y", "overflow"),
     "channel_missing": ("all of gyr_z",),
@@ -117,6 +116,13 @@ def test_warnings_for_missing_samples_and_for_gravity():
     first, second = check(recording)
     assert "7 samples are missing" in first and "2.5 s" in first
     assert "5.0% off gravity" in second
+
+
+def test_a_start_in_motion_is_a_warning():
+    keep = good().time > 1.3
+    cut = eqx.tree_at(lambda r: (r.time, r.gyr, r.acc, r.missing), good(), replace_fn=lambda x: x[keep])
+    (warning,) = check(cut)
+    assert "moves in the first 0.2 s" in warning and warning.endswith(".")
 
 
 @pytest.mark.parametrize("place", [0, 1, 700, 1599])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from jaxsat.errors import InputError
 from jaxsat.studies.metrics import (
     align_yaw_translation,
+    attitude_errors,
     geometric_mean_ratio,
     last_position_error,
     load_broad_truth,
@@ -176,3 +177,19 @@ def test_files_that_hold_no_truth_are_named(tmp_path):
         for path in (wrong, tmp_path / "absent"):
             with pytest.raises(InputError, match=path.name):
                 load(path)
+
+
+def test_attitude_errors_are_those_that_were_put_in():
+    truth = Rotation.random(200, random_state=1)
+    heading, inclination = 0.3, 0.05
+    error = Rotation.from_rotvec([0, 0, heading]) * Rotation.from_rotvec([inclination, 0, 0])
+    found = (error * truth).as_quat()[:, [3, 0, 1, 2]]
+    expected = truth.as_quat()[:, [3, 0, 1, 2]]
+    scored = np.ones(200, bool)
+    raw = attitude_errors(found, expected, scored, align=False)
+    assert raw.heading == pytest.approx(heading) and raw.inclination == pytest.approx(inclination)
+    assert raw.total == pytest.approx(error.magnitude())
+    aligned = attitude_errors(-found, expected, scored)
+    assert aligned.heading == pytest.approx(0, abs=1e-9) and aligned.total == pytest.approx(inclination)
+    scored[:100], found[:100] = False, [1.0, 0.0, 0.0, 0.0]
+    assert attitude_errors(found, expected, scored, align=False).inclination == pytest.approx(inclination)

@@ -11,7 +11,8 @@ from jaxsat.cli import main
 COLUMNS = [
     "time",
     *("q_w", "q_x", "q_y", "q_z"),
-    *(f"{what}_{axis}" for what in ("euler", "bias") for axis in "xyz"),
+    *("euler_x", "euler_y", "euler_z", "inclination_sd", "heading_sd"),
+    *("bias_x", "bias_y", "bias_z"),
     *(f"sat_{sensor}_{axis}" for sensor in ("gyr", "acc") for axis in "xyz"),
 ]
 CHANNELS = [f"{sensor}_{axis}" for sensor in ("gyr", "acc") for axis in "xyz"]

@@ -4,10 +4,11 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
-from jaxsat.pipeline import estimate
+from jaxsat.pipeline import LATEST_FIRST_REST, estimate
 from jaxsat.signals.readers import read
 from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
 from jaxsat.studies.motions import Bar, Walk
@@ -188,10 +189,31 @@ def test_missing_samples_carry_no_weight_and_one_sentence_says_so():
     assert position_rmse(found.trajectory.position, truth.position) < 0.05
 
 
-def test_no_rest_at_the_start_is_one_sentence():
+def test_a_recording_without_rest_is_told_what_it_supports():
     recording, _ = walk(4)
-    rest = recording.rest.copy()
-    rest[:150] = False
-    with pytest.raises(InputError, match="no rest at the start") as caught:
-        estimate(eqx.tree_at(lambda r: r.rest, recording, rest))
+    never = eqx.tree_at(lambda r: r.rest, recording, np.zeros(len(recording), bool))
+    with pytest.raises(
+        InputError, match=r"no rest is found.*supports .*orientation.*no trajectory"
+    ) as caught:
+        estimate(never)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("bias_sd", [1e-3, 0.1], ids=["gyroscope", "controller"])
+def test_a_start_in_motion_takes_its_attitude_from_a_later_rest(bias_sd):
+    """Rests until the second stance are not told: attitude and way until there are as far off as they say."""
+    recording, truth = walk(4)
+    rest = recording.rest.copy()
+    arrivals = np.flatnonzero(rest[1:] & ~rest[:-1]) + 1
+    first = int(arrivals[1])
+    rest[:first] = False
+    assert first * recording.period > LATEST_FIRST_REST
+    moving = eqx.tree_at(lambda r: r.rest, recording, rest)
+    given = {"rails.gyr": "none", "rails.acc": "none", "smoother.gyr_bias_sd": bias_sd}
+    found = estimate(moving, load_config(None, method="standard", **given)).trajectory
+    turn, true = (Rotation.from_quat(q[0], scalar_first=True).inv() for q in (found.q_nb, truth.q_nb))
+    tilt = np.arccos(np.clip(turn.apply([0, 0, 1]) @ true.apply([0, 0, 1]), -1, 1))
+    sd = np.sqrt(np.diag(found.covariance[0]))
+    assert tilt < 0.02 and tilt < 3 * np.hypot(*sd[:2]) < 0.25
+    way = turn.apply(found.position[first] - found.position[0])
+    assert np.linalg.norm(way - true.apply(truth.position[first] - truth.position[0])) < 0.1

@@ -125,7 +125,7 @@ def test_a_trial_that_cannot_be_used_costs_one_row(table, trials):
     assert list(table["trial"].unique()) == [trial.name for trial in trials]
     assert list(table.groupby("trial", sort=False).size()) == [4, 1, 4, 4]
     failed = table[table["trial"] == "moving"].iloc[0]
-    assert failed["status"] == "failed" and "no rest at the start" in failed["note"]
+    assert failed["status"] == "failed" and "no rest is found" in failed["note"]
     assert np.isnan(failed["path_rmse"])
     assert table["note"].notna().sum() == 1
 

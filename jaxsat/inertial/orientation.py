@@ -1,4 +1,4 @@
-"""Attitude from a gyroscope and an accelerometer, without a rest after the motion.
+"""Attitude from a gyroscope and an accelerometer by complementary filters, without a rest after the motion.
 
 The estimates of J. A. Barraza-Madrigal et al., Rev. Mex. Ing. Biomed. 35(3), 2014, 241-252 (paper C), with its
 misprints corrected: Eq. 2 and 4 need half angles and no factor ½, Eq. 7 is [1, α/2, φ/2, θ/2], and with the DCM of
@@ -18,15 +18,11 @@ from jaxtyping import Array, Bool, Float
 from jaxsat.inertial.components import Quaternion, Vector
 from jaxsat.inertial.rotations import (
     quat_between,
-    quat_conjugate,
-    quat_multiply,
-    quat_normalise,
-    quat_rotate,
     quat_to_matrix,
 )
 
-Estimate = Literal["gyro", "accel", "gyro_accel", "pi", "smoothed"]
-"""σ_gyro; σ_accel; both added; both with the PI controller; that run forward and backward."""
+Estimate = Literal["gyro", "accel", "gyro_accel", "pi"]
+"""σ_gyro; σ_accel; both added; both with the PI controller."""
 Update = Literal["exact", "comp", "imp"]
 """How σ turns the attitude: as a rotation vector, by `Q_comp` (Eq. 4) or by `Q_imp` (Eq. 8)."""
 Direction = Literal["mean", "unit"]
@@ -34,6 +30,8 @@ Direction = Literal["mean", "unit"]
 
 WEIGHT = 0.5
 """ω_σ of Eq. 15."""
+OFFSET_TIME = 1.0
+"""A resting gyroscope reads its own offset, averaged over about so long (s): the paper's first second."""
 _UP = (0.0, 0.0, 1.0)
 
 
@@ -107,45 +105,66 @@ def orientation(
     start: Start,
     gains: Gains,
     *,
+    rest: Bool[Array, "N"] | None = None,
     estimate: Estimate = "pi",
     update: Update = "exact",
     direction: Direction = "mean",
 ) -> Attitude:
-    """Attitude over a recording (paper C, Eq. 6-15): one of its four estimates, or `smoothed`.
+    """Attitude over a recording by one of the four estimates of paper C (Eq. 6-15).
 
     signal: angular rate and specific force (rad/s, m/s²); period: of each sample (s), zero pads; trusted: whether
     the gyroscope and the accelerometer of a sample can be believed (measured, not saturated). Specific force that
-    is not trusted corrects nothing, and while the gyroscope is not, the integral stands still. `smoothed` runs the
-    PI controller forward, from its end backward, and takes heading from the first and level from the mean of both:
-    their lags are opposite. Differentiable in the gains, the signal and the start; `vmap` over any of them.
+    is not trusted corrects nothing, and while the gyroscope is not, the integral stands still. rest: where the
+    sensor is known to rest; there the integral follows what the gyroscope reads instead of the drift, about the
+    vertical too. Differentiable in the gains, the signal and the start; `vmap` over any of them.
     """
-    if estimate == "smoothed":
-        return _smoothed(signal, period, trusted, start, gains, update, direction)
-    return _run(
-        signal, period, trusted, start, jnp.zeros(3, signal.dtype), gains, estimate, update, direction
-    )
+    rest = jnp.zeros(len(signal), bool) if rest is None else rest
+    return _run(signal, period, trusted, rest, start, gains, estimate, update, direction)
 
 
-def _run(
-    signal, period, trusted, start: Start, integral, gains: Gains, estimate, update, direction
+def ending(found: Attitude, start: Start) -> Start:
+    """What is known at the end of a recording: attitude, and the offset with what the integral learnt."""
+    return Start(found.q_nb[-1], start.offset - found.integral[-1], start.gravity)
+
+
+def backward(
+    signal: Float[Array, "N 6"],
+    period: Float[Array, "N"],
+    trusted: Bool[Array, "N 2"],
+    end: Start,
+    gains: Gains,
+    rest: Bool[Array, "N"] | None = None,
 ) -> Attitude:
+    """The PI controller run from a known end towards the start; rows in the order of time, as of `orientation`."""
+    rest = jnp.zeros(len(signal), bool) if rest is None else rest
+    # In reversed time the sensor turns the other way, its offset included.
+    mirror = jnp.concatenate([-signal[::-1, :3], signal[::-1, 3:]], axis=1)
+    turned = Start(end.q_nb, -end.offset, end.gravity)
+    found = _run(mirror, period[::-1], trusted[::-1], rest[::-1], turned, gains, "pi", "exact", "mean")
+    return Attitude(found.q_nb[::-1], -found.integral[::-1])
+
+
+def _run(signal, period, trusted, rest, start: Start, gains: Gains, estimate, update, direction) -> Attitude:
     def step(state, sample):
         q, force, learnt = state
-        rate, specific, T, trust = sample
+        rate, specific, T, trust, still = sample
         weight = trust[1] * _gate(specific, start.gravity, gains.gate)
         # A low-pass in a frame that hardly turns: what moves about a place averages to gravity there.
         share = weight * T / jnp.where(T > 0.0, gains.tau + T, 1.0)
         measured = q.rotate(Vector.of(_up(specific, start.gravity, direction)))
         force = force + (measured - force) * share
         drift = q.conjugate().rotate(Vector(force.y, -force.x, jnp.zeros_like(force.x))) * weight
-        sigma = (Vector.of(rate) - Vector.of(start.offset)) * T
+        turning = Vector.of(rate) - Vector.of(start.offset)
+        sigma = turning * T
         if estimate == "accel":
             sigma = drift
         elif estimate == "gyro_accel":
             sigma = sigma + drift
         elif estimate == "pi":
             added = learnt + drift * (WEIGHT * gains.ki * T * trust[0])
-            learnt = Vector(*(jnp.clip(x, -gains.limit, gains.limit) for x in added))
+            read = learnt - (turning + learnt) * (T / (OFFSET_TIME + T))
+            chosen = (jnp.where(still & (trust[0] > 0.0), a, b) for a, b in zip(read, added, strict=True))
+            learnt = Vector(*(jnp.clip(x, -gains.limit, gains.limit) for x in chosen))
             sigma = sigma + (drift * (WEIGHT * gains.kp) + learnt) * T
         q = q @ turn(sigma, update)
         norm = 1.0 / jnp.sqrt(q.w**2 + q.x**2 + q.y**2 + q.z**2)
@@ -153,27 +172,11 @@ def _run(
         return (q, force, learnt), (q.stack(), learnt.stack())
 
     up = Vector(*(jnp.asarray(x, signal.dtype) for x in _UP))
-    initial = (Quaternion.of(start.q_nb), up, Vector.of(integral))
-    samples = (signal[:, :3], signal[:, 3:], period, trusted.astype(signal.dtype))
+    nothing = jnp.zeros(3, signal.dtype)
+    initial = (Quaternion.of(start.q_nb), up, Vector.of(nothing))
+    samples = (signal[:, :3], signal[:, 3:], period, trusted.astype(signal.dtype), rest)
     _, (q_nb, learnt) = jax.lax.scan(step, initial, samples)
-    return Attitude(jnp.concatenate([start.q_nb[None], q_nb]), jnp.concatenate([integral[None], learnt]))
-
-
-def _smoothed(signal, period, trusted, start: Start, gains: Gains, update, direction) -> Attitude:
-    forward = _run(signal, period, trusted, start, jnp.zeros(3, signal.dtype), gains, "pi", update, direction)
-    # In reversed time the sensor turns the other way, its offset included.
-    mirror = jnp.concatenate([-signal[::-1, :3], signal[::-1, 3:]], axis=1)
-    end = Start(forward.q_nb[-1], -start.offset, start.gravity)
-    again = _run(
-        mirror, period[::-1], trusted[::-1], end, -forward.integral[-1], gains, "pi", update, direction
-    )
-
-    def level(ahead, back):
-        up = jnp.asarray(_UP, signal.dtype)
-        seen = quat_rotate(quat_conjugate(ahead), up) + quat_rotate(quat_conjugate(back), up)
-        return quat_normalise(quat_multiply(quat_between(quat_rotate(ahead, seen), up), ahead))
-
-    return Attitude(jax.vmap(level)(forward.q_nb, again.q_nb[::-1]), forward.integral)
+    return Attitude(jnp.concatenate([start.q_nb[None], q_nb]), jnp.concatenate([nothing[None], learnt]))
 
 
 def _length(v: Float[Array, "3"]) -> Float[Array, ""]:

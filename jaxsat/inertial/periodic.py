@@ -84,6 +84,18 @@ def phases(frequency: Float[Array, "F"], time: Float[Array, "N"]) -> Float[Array
     return 2 * jnp.pi * time[:, None] * frequency[None, :]
 
 
+def references(
+    frequency: Float[Array, "F"], time: Float[Array, "N"], gain: Complex[Array, "F"]
+) -> tuple[Float[Array, "N W"], Float[Array, "N W"]]:
+    """Reference inputs of a signal, x, and of the motion behind it, x̂, with a constant at their end.
+
+    The constant takes up an offset of the signal, and is no motion.
+    """
+    angle, one = phases(frequency, time), jnp.ones((len(time), 1), time.dtype)
+    x = jnp.concatenate([compensated(angle, jnp.ones_like(gain)), one], axis=1)
+    return x, jnp.concatenate([compensated(angle, gain), 0 * one], axis=1)
+
+
 def bmflc(
     signal: Float[Array, "N"],
     time: Float[Array, "N"],

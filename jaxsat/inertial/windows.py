@@ -27,7 +27,7 @@ class Windows(eqx.Module):
         return signal[self.index]
 
     def joined(self, rows: Float[np.ndarray, "V L"]) -> Float[np.ndarray, "N"]:
-        """The rows blended where they overlap, each with the weight of a Hann window.
+        """The rows blended where they overlap, each with the weight of a Hann window; 0 where no window lies.
 
         Of standard deviations, the blend is an upper bound: neighbours are not independent.
         """
@@ -35,7 +35,7 @@ class Windows(eqx.Module):
         total, weight = np.zeros(self.samples), np.zeros(self.samples)
         np.add.at(total, self.index, rows * taper)
         np.add.at(weight, self.index, np.broadcast_to(taper, rows.shape))
-        return total / weight
+        return total / np.where(weight > 0.0, weight, 1.0)
 
 
 def harmonics(time: Float[np.ndarray, "L"], frequency: Float[np.ndarray, "F"]) -> Float[np.ndarray, "L W"]:

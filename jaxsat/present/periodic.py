@@ -90,10 +90,9 @@ def periodic_text(found: PeriodicEstimate, path: Path) -> str:
     rows = [["motion", "band (Hz)", "RMS", "sd", ""]]
     for sensor, (low, high) in found.band.items():
         where, name, unit = SENSORS[sensor]
-        scale, prefix = (1e3, "mrad") if unit == "rad" else (1e3, "mm")
         for j in range(*where.indices(6)):
             sd = _typical_sd(found, j)
-            rms = scale * np.sqrt(np.mean(found.motion[:, j] ** 2))
-            known = "-" if sd is None else f"{scale * sd:.3g}"
-            rows.append([f"{name} {MOTION[j][-1]}", f"{low:.3g}-{high:.3g}", f"{rms:.4g}", known, prefix])
+            rms = 1e3 * np.sqrt(np.mean(found.motion[:, j] ** 2))
+            known = "-" if sd is None else f"{1e3 * sd:.3g}"
+            rows.append([f"{name} {MOTION[j][-1]}", f"{low:.3g}-{high:.3g}", f"{rms:.4g}", known, f"m{unit}"])
     return "\n".join([*lines, columns(rows), f"table: {path}"])

@@ -19,6 +19,7 @@ from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import CHANNELS, Recording
 from jaxsat.signals.rests import find_rests, runs
+from jaxsat.signals.support import find_support
 
 _SENSORS = {"gyr": ("gyroscope", "rad/s", slice(0, 3)), "acc": ("accelerometer", "m/s²", slice(3, 6))}
 
@@ -77,6 +78,13 @@ def summarise_orientation(found: Orientation, source: Path | None = None) -> dic
         "gravity": float(found.start.gravity),
         "gyr_offset": found.start.offset.tolist(),
         "bias_at_the_end": found.bias[-1].tolist(),
+        "sd": None
+        if found.sd is None
+        else {
+            "inclination_median": float(np.median(found.sd[:, 0])),
+            "inclination_largest": float(found.sd[:, 0].max()),
+            "heading_at_the_end": float(found.sd[-1, 1]),
+        },
         "warnings": found.warnings,
     }
 
@@ -165,7 +173,7 @@ def warnings_of(estimate: Estimate) -> list[str]:
 def inspect(recording: Recording, config: Config) -> dict[str, Any]:
     """What a recording holds before anything is estimated, ready for JSON (SI units).
 
-    Raises `InputError` where it makes no sense (units, rate, no rest at its start).
+    Raises `InputError` where it makes no sense (units, rate).
     """
     warnings = check(recording)
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
@@ -190,6 +198,7 @@ def inspect(recording: Recording, config: Config) -> dict[str, Any]:
         "saturated": dict(zip(CHANNELS, saturated.sum(axis=0).tolist(), strict=True)),
         "rails": rails_summary(rails, find_gaps(sign)),
         "rests": _rests(recording, rest),
+        "support": find_support(recording, rest).sentence(),
         "warnings": warnings,
     }
 

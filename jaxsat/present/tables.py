@@ -104,12 +104,15 @@ def orientation_table(found: Orientation) -> pd.DataFrame:
     """One row a sample: the attitude at its start.
 
     Columns: `time` (s), `q_w…q_z` (body to navigation frame), `euler_*` (rad, about x, y and z; Q_z ⊗ Q_y ⊗ Q_x),
-    `bias_*` (rad/s, the gyroscope's offset as known then), and `sat_*`, which channels saturate.
+    `inclination_sd` and `heading_sd` (rad, empty for the filters, which do not know them), `bias_*` (rad/s, the
+    gyroscope's offset as known then), and `sat_*`, which channels saturate.
     """
+    unknown = np.full((len(found.recording), 2), np.nan)
     columns = {
         ("time",): found.recording.time,
         ("q_w", "q_x", "q_y", "q_z"): found.q_nb,
         tuple(_axes("euler")): found.euler,
+        ("inclination_sd", "heading_sd"): unknown if found.sd is None else found.sd,
         tuple(_axes("bias")): found.bias,
         tuple(f"sat_{channel}" for channel in CHANNELS): found.sign != 0,
     }

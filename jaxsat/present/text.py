@@ -66,7 +66,7 @@ def inspection_text(found: Mapping[str, Any]) -> str:
                 str(longest),
             ]
         )
-    lines.append(columns(rows))
+    lines += [columns(rows), found["support"]]
     lines += [f"warning: {warning}" for warning in found["warnings"]]
     return "\n".join(lines)
 
@@ -119,9 +119,16 @@ def orientation_text(found: Orientation, path: Path) -> str:
         ["offset", ", ".join(f"{x:+.3f}" for x in offset) + " deg/s"],
         ["first", ", ".join(f"{x:+.2f}" for x in first) + " deg about x, y, z"],
         ["last", ", ".join(f"{x:+.2f}" for x in last) + " deg; z drifts with the gyroscope"],
+        *([] if found.sd is None else [["sd", _sd_words(np.rad2deg(found.sd))]]),
         ["table", str(path)],
     ]
     return "\n".join(f"{label:<14}{text}" for label, text in rows)
+
+
+def _sd_words(sd: np.ndarray) -> str:
+    """Of inclination and heading (deg)."""
+    middle, largest = np.median(sd[:, 0]), sd[:, 0].max()
+    return f"inclination {middle:.2g} deg, at most {largest:.2g}; heading {sd[-1, 1]:.2g} deg at the end"
 
 
 def sweep_text(table: pd.DataFrame, path: Path) -> str:

@@ -16,6 +16,7 @@ from jaxsat.inertial.windows import Windows, harmonics, neighbours, periodogram
 
 SAMPLES = 256
 """Length of the stretches that are filled together; as many weights as samples."""
+CLEAN = 8
 ITERATIONS = 12
 DAMPING = 0.7
 
@@ -26,7 +27,7 @@ class HarmonicFill(eqx.Module):
     signal: Float[np.ndarray, "N"]
     """As measured, and the posterior mean where saturated: never short of the measured value."""
     sd: Float[np.ndarray, "N"]
-    """sd of each value; that of the noise where it was measured."""
+    """sd of each value; that of the noise where it was measured, 0 throughout if all were."""
 
 
 class _Sites(eqx.Module):
@@ -70,7 +71,7 @@ def _fill(signal: np.ndarray, sign: np.ndarray, measured: np.ndarray) -> Harmoni
     index = np.arange(len(signal))
     offset, scale = signal[measured].mean(), max(signal[measured].std(), 1e-300)
     y = (signal - offset) / scale
-    windows = Windows.cut(len(y), min(SAMPLES, len(y)))
+    windows = _with_gaps(Windows.cut(len(y), min(SAMPLES, len(y))), measured)
     length = windows.length
     frequency = np.arange(1, length // 2) / (2 * length)
     x = harmonics(np.arange(length, dtype=float), frequency)
@@ -84,6 +85,7 @@ def _fill(signal: np.ndarray, sign: np.ndarray, measured: np.ndarray) -> Harmoni
         jnp.asarray(windows.of(measured)), jnp.asarray(x), jnp.asarray(neighbours(len(frequency), 1)), start,
         ITERATIONS,
     )  # fmt: skip
+    # Windows without gaps may be left out: there nothing is filled.
     filled = windows.joined(np.asarray(mean))
     sd = windows.joined(np.sqrt(np.asarray(variance)))
     # Rounding must not put a fill short of its rail.
@@ -92,6 +94,19 @@ def _fill(signal: np.ndarray, sign: np.ndarray, measured: np.ndarray) -> Harmoni
         np.where(measured, signal, beyond * scale + offset),
         np.where(measured, float(np.sqrt(noise)), sd) * scale,
     )
+
+
+def _with_gaps(windows: Windows, measured: Bool[np.ndarray, "N"]) -> Windows:
+    """The windows with gaps, and at least `CLEAN` of the others, from which the spectrum is learnt too.
+
+    In all a power of two where there are so many: channels and recordings then share compiled programs.
+    """
+    gaps = ~windows.of(measured).all(axis=1)
+    count = min(len(gaps), 1 << int(gaps.sum() + CLEAN - 1).bit_length())
+    clean = np.flatnonzero(~gaps)
+    drawn = clean[np.linspace(0, len(clean) - 1, count - gaps.sum()).astype(int)] if len(clean) else clean
+    used = np.sort(np.concatenate([np.flatnonzero(gaps), drawn]))
+    return Windows(windows.start[used], windows.length, windows.samples)
 
 
 @partial(jax.jit, static_argnames="iterations")

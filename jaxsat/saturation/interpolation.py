@@ -5,6 +5,8 @@ derivatives, because a limb has a finite jerk. Its size and length scale are tho
 around the gaps are likeliest. A gap takes the mean given its neighbours, and never less than its rail.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
@@ -15,51 +17,73 @@ from jaxsat.signals.rests import runs
 REACH = 0.25
 """How far to either side of a gap samples are looked at (s)."""
 _LEARN_FROM = 20
+_MOST = 256
 # A kernel matrix of close samples is singular to rounding: noise never counts as less than this share of the size.
 _LEAST_NOISE = 1e-3
 
 
+class Interpolated(NamedTuple):
+    """Channels with their gaps filled."""
+
+    signal: Float[np.ndarray, "N C"]
+    variance: Float[np.ndarray, "N C"]
+    """Of each filled value, 0 where measured; taken as independent, the values of a gap sum up to what its integral
+    is uncertain by, which is what an angle sees of them."""
+
+
 def interpolate_gaps(
-    signal: Float[np.ndarray, "N C"], sign: Int[np.ndarray, "N C"], period: float
-) -> Float[np.ndarray, "N C"]:
+    signal: Float[np.ndarray, "N C"],
+    sign: Int[np.ndarray, "N C"],
+    period: float,
+    missing: Bool[np.ndarray, "N C"] | None = None,
+) -> Interpolated:
     """The channels of one sensor with saturated values replaced by what their neighbours in time suggest.
 
-    signal: in one unit; sign: direction of saturation of each value, 0 where there is none; period: s. Honest for
-    gaps shorter than the motion's own time scale: within longer ones the neighbours do not say how high a peak was.
+    signal: in one unit; sign: direction of saturation of each value, 0 where there is none; period: s; missing:
+    values that were not measured, which say nothing. Within gaps longer than the motion's own time scale the
+    neighbours do not say how high a peak was, and the variance says so.
     """
+    usable = (sign == 0) & (True if missing is None else ~missing)
     gaps = [
         (c, s, int(i), int(j))
         for c in range(signal.shape[1])
         for s in (-1, 1)
         for i, j in zip(*runs(sign[:, c] == s), strict=True)
     ]
+    variance = np.zeros_like(signal)
     if not gaps:
-        return signal
+        return Interpolated(signal, variance)
     reach = max(3, round(REACH / period))
-    around = [_around(sign[:, c], i, j, reach) for c, _, i, j in gaps]
-    noise = _noise(signal, sign)
+    around = [_around(usable[:, c], i, j, reach) for c, _, i, j in gaps]
+    noise = _noise(signal, usable)
     drawn = np.unique(np.linspace(0, len(gaps) - 1, _LEARN_FROM).astype(int))
     size, length = _learn([(around[k] * period, signal[around[k], gaps[k][0]]) for k in drawn], noise)
     filled = signal.copy()
     for (c, s, i, j), near in zip(gaps, around, strict=True):
-        if not len(near):
-            continue
-        factor = cho_factor(_covariance(near * period, near * period, size, length, noise))
-        across = _covariance(np.arange(i, j) * period, near * period, size, length)
-        guess = across @ cho_solve(factor, signal[near, c])
-        filled[i:j, c] = s * np.maximum(s * guess, s * signal[i:j, c])
-    return filled
+        inside, beside = np.arange(i, j) * period, near * period
+        # Of a gap of thousands of samples some do.
+        some = inside[:: -(-(j - i) // _MOST)]
+        total = _covariance(some, some, size, length).mean() * (j - i) ** 2
+        if len(near):
+            factor = cho_factor(_covariance(beside, beside, size, length, noise))
+            across = _covariance(inside, beside, size, length)
+            guess = across @ cho_solve(factor, signal[near, c])
+            filled[i:j, c] = s * np.maximum(s * guess, s * signal[i:j, c])
+            sums = across.sum(axis=0)
+            total -= sums @ cho_solve(factor, sums)
+        variance[i:j, c] = max(total, 0.0) / (j - i)
+    return Interpolated(filled, variance)
 
 
-def _around(sign: Int[np.ndarray, "N"], i: int, j: int, reach: int) -> Int[np.ndarray, "n"]:
-    """Unsaturated samples beside the gap [i, j)."""
-    near = np.arange(max(0, i - reach), min(len(sign), j + reach))
-    return near[sign[near] == 0]
+def _around(usable: Bool[np.ndarray, "N"], i: int, j: int, reach: int) -> Int[np.ndarray, "n"]:
+    """Samples beside the gap [i, j) that say something of it."""
+    near = np.arange(max(0, i - reach), min(len(usable), j + reach))
+    return near[usable[near]]
 
 
-def _noise(signal: np.ndarray, sign: np.ndarray) -> float:
-    """sd of white noise, from the quietest tenth of the second differences of unsaturated samples."""
-    clean: Bool[np.ndarray, "n C"] = (sign[:-2] == 0) & (sign[1:-1] == 0) & (sign[2:] == 0)
+def _noise(signal: np.ndarray, usable: Bool[np.ndarray, "N C"]) -> float:
+    """sd of white noise, from the quietest tenth of the second differences of usable samples."""
+    clean: Bool[np.ndarray, "n C"] = usable[:-2] & usable[1:-1] & usable[2:]
     second = np.abs(np.diff(signal, 2, axis=0))[clean]
     # The 0.1 quantile of |z| is 0.126, and a second difference has √6 times the noise.
     return float(np.quantile(second, 0.1) / (0.126 * np.sqrt(6))) if len(second) else 0.0

@@ -35,7 +35,7 @@ def check(recording: Recording) -> list[str]:
     warnings += _check_gravity(recording)
     _check_stuck(recording)
     warnings += _check_units(recording)
-    _check_start(recording)
+    warnings += _check_start(recording)
     return [f"{name}: {warning}" for warning in warnings]
 
 
@@ -237,15 +237,15 @@ def _check_units(recording: Recording) -> Iterator[str]:
     yield f"the angular rate fits gravity better at {rates}: a wrong rate, or much clipping; check --rate."
 
 
-def _check_start(recording: Recording) -> None:
+def _check_start(recording: Recording) -> Iterator[str]:
     """At rest, the sensor turns less than `TILT` within `START`, and gravity in it is as steady."""
     n = max(3, round(START / recording.period))
     turned = np.linalg.norm(recording.gyr[:n], axis=1).sum() * recording.period
     shaken = np.sqrt(recording.acc[:n].var(axis=0).sum()) / GRAVITY
     if max(turned, shaken) > TILT:
-        raise InputError(
-            f"{recording.name}: the sensor moves in the first {START} s ({np.rad2deg(turned):.0f} deg, "
-            f"{shaken * GRAVITY:.2g} m/s²); cut the recording so that it starts at rest."
+        yield (
+            f"the sensor moves in the first {START} s ({np.rad2deg(turned):.0f} deg, {shaken * GRAVITY:.2g} m/s²): "
+            "its attitude there is found from what follows, less surely; start recordings at rest."
         )
 
 

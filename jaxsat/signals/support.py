@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import signal
 
 from jaxsat.signals.recording import Recording
@@ -77,25 +77,24 @@ def find_band(x: Float[np.ndarray, "N C"], period: float) -> tuple[float, float,
     return float(max(frequency[low] - step, step)), float(frequency[k]), float(frequency[high] + step)
 
 
-def find_support(recording: Recording) -> Support:
+def find_support(recording: Recording, rest: Bool[np.ndarray, "N"] | None = None) -> Support:
     """Which of trajectory, periodic motion and orientation a recording supports.
 
-    A trajectory needs both sensors and rests, the first one at the start; a periodic motion one sensor and a
-    frequency that stands out of its spectrum; an orientation a gyroscope.
+    A trajectory needs both sensors and a rest; a periodic motion one sensor and a frequency that stands out of its
+    spectrum; an orientation both sensors. rest: as found before; None detects them.
     """
     there = measured_sensors(recording)
     reasons = {}
-    rest = find_rests(recording)
-    first = recording.time[np.argmax(rest)] - recording.time[0] if rest.any() else np.inf
-    if not (there["gyr"] and there["acc"]):
-        reasons["trajectory"] = f"no {'gyroscope' if there['acc'] else 'accelerometer'}"
+    rest = find_rests(recording) if rest is None else rest
+    both = there["gyr"] and there["acc"]
+    lacking = f"no {'gyroscope' if there['acc'] else 'accelerometer' if there['gyr'] else 'sensor'}"
+    if not both:
+        reasons["trajectory"] = lacking
     elif not rest.any():
         reasons["trajectory"] = "the sensor never rests"
-    elif first > 1.0:
-        reasons["trajectory"] = f"no rest in the first second, the first one at {first:.3g} s"
     else:
-        reasons["trajectory"] = f"at rest for {rest.mean():.0%} of the time"
-    trajectory = bool(there["gyr"] and there["acc"] and first <= 1.0)
+        first = recording.time[np.argmax(rest)] - recording.time[0]
+        reasons["trajectory"] = f"at rest for {rest.mean():.0%} of the time, first at {first:.3g} s"
     bands = {
         name: find_band(x, recording.period)
         for name, x in (("acc", recording.acc), ("gyr", recording.gyr))
@@ -106,5 +105,5 @@ def find_support(recording: Recording) -> Support:
         ", ".join(f"{name} at {band[1]:.3g} Hz" for name, band in found.items())
         or "no frequency stands out of the spectrum"
     )
-    reasons["orientation"] = "gyroscope present" if there["gyr"] else "no gyroscope"
-    return Support(trajectory, bool(found), there["gyr"], reasons)
+    reasons["orientation"] = "both sensors" if both else lacking
+    return Support(both and bool(rest.any()), bool(found), both, reasons)
