@@ -2,7 +2,7 @@
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all lint bench
+.PHONY: demo test test-all lint bench board
 demo: $(STAMP)
 	$(VENV)/bin/jaxsat demo
 
@@ -27,3 +27,8 @@ $(STAMP): pyproject.toml
 bench: $(STAMP)
 	$(VENV)/bin/python -m pip install --quiet --editable ".[bench]"
 	$(VENV)/bin/python scripts/bench.py
+
+# The accuracy board: every method on the real recordings in DATA; half an hour.
+DATA := ../shared/data
+board: $(STAMP)
+	$(VENV)/bin/python scripts/accuracy.py $(DATA)

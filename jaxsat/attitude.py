@@ -22,7 +22,7 @@ from jaxsat.inertial.orientation import (
     start_at_rest,
 )
 from jaxsat.inertial.strapdown import Samples
-from jaxsat.pipeline import MOVING_START_SD, MOVING_START_TILT_SD, given_gains
+from jaxsat.pipeline import LEFT_OFFSET_SD, MOVING_START_SD, MOVING_START_TILT_SD, given_gains
 from jaxsat.saturation.interpolation import interpolate_gaps
 from jaxsat.signals.checks import TILT, check
 from jaxsat.signals.formats import GRAVITY
@@ -252,7 +252,7 @@ def _smooth(
     q_nb, variance = _bounded(samples, start, *numbers)
     variance = np.array(variance)[: len(rest)]
     # The offset, known from a second at rest, is off by the same until the next rest.
-    offset = config.smoother.gyr_bias_sd if moving else config.noise.gyr_density / np.sqrt(FIRST)
+    offset = LEFT_OFFSET_SD if moving else config.noise.gyr_density / np.sqrt(FIRST)
     for i, j in zip(*runs(~rest), strict=True):
         variance[i:j, 1] += (offset * T * np.arange(j - i)) ** 2
         variance[j:, 1] += (offset * T * (j - i)) ** 2

@@ -7,8 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float, Int
-from scipy.signal import welch
 
 from jaxsat.config import Config
 from jaxsat.errors import InputError
@@ -199,7 +199,7 @@ def _filters(config: Config, period: float, low: float) -> tuple[tuple[Filter, .
 
 def _noise_variance(x: np.ndarray, period: float, high: float) -> float:
     """Variance of white noise as strong as what lies an octave and more above the band, or near the top."""
-    frequency, power = welch(x, 1 / period, nperseg=min(256, len(x)))
+    frequency, power = scipy.signal.welch(x, 1 / period, nperseg=min(256, len(x)))
     above = power[frequency >= min(2 * high, 0.4 / period)]
     return max(float(np.median(above)) * 0.5 / period, 1e-8 * float(x.var()), 1e-300)
 

@@ -34,6 +34,8 @@ SHORTEST_OFFSET_REST = 1.0
 # moves before its first rest: the PI controller knows it no worse on the trials of results/orientation.
 MOVING_START_SD = 3.0
 MOVING_START_TILT_SD = 0.05
+# sd of the gyroscope offset that is left while a rate is integrated back from the first rest (rad/s).
+LEFT_OFFSET_SD = 1e-3
 
 
 class Trajectory(eqx.Module):
@@ -264,7 +266,7 @@ def _trial(
     # controller of `orientation` where that is so long that its offset would do more than the controller errs.
     q_nb = quat_between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
     velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
-    drifted = (config.smoother.gyr_bias_sd * first * T) ** 2 + noise.gyr_density**2 * first * T
+    drifted = (LEFT_OFFSET_SD * first * T) ** 2 + noise.gyr_density**2 * first * T
     if first * T > LATEST_FIRST_REST:
         tilt += min(drifted, MOVING_START_TILT_SD**2)
     if drifted > MOVING_START_TILT_SD**2:

@@ -199,8 +199,8 @@ def test_a_recording_without_rest_is_told_what_it_supports():
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("bias_sd", [1e-3, 0.1], ids=["gyroscope", "controller"])
-def test_a_start_in_motion_takes_its_attitude_from_a_later_rest(bias_sd):
+@pytest.mark.parametrize("offset_sd", [1e-3, 0.1], ids=["gyroscope", "controller"])
+def test_a_start_in_motion_takes_its_attitude_from_a_later_rest(offset_sd, monkeypatch):
     """Rests until the second stance are not told: attitude and way until there are as far off as they say."""
     recording, truth = walk(4)
     rest = recording.rest.copy()
@@ -209,7 +209,8 @@ def test_a_start_in_motion_takes_its_attitude_from_a_later_rest(bias_sd):
     rest[:first] = False
     assert first * recording.period > LATEST_FIRST_REST
     moving = eqx.tree_at(lambda r: r.rest, recording, rest)
-    given = {"rails.gyr": "none", "rails.acc": "none", "smoother.gyr_bias_sd": bias_sd}
+    monkeypatch.setattr("jaxsat.pipeline.LEFT_OFFSET_SD", offset_sd)
+    given = {"rails.gyr": "none", "rails.acc": "none"}
     found = estimate(moving, load_config(None, method="standard", **given)).trajectory
     turn, true = (Rotation.from_quat(q[0], scalar_first=True).inv() for q in (found.q_nb, truth.q_nb))
     tilt = np.arccos(np.clip(turn.apply([0, 0, 1]) @ true.apply([0, 0, 1]), -1, 1))

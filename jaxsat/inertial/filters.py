@@ -7,8 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Complex, Float
-from scipy import signal
 
 from jaxsat.errors import InputError
 
@@ -37,14 +37,14 @@ def butterworth(kind: str, order: int, cutoff: float, rate: float | None) -> Fil
         raise InputError(f"the {kind} filter's cut-off is {cutoff} Hz; give a positive frequency.")
     if rate is None:
         return _analogue(
-            *cast(Any, signal.butter(order, 2 * np.pi * cutoff, kind, analog=True, output="zpk"))
+            *cast(Any, scipy.signal.butter(order, 2 * np.pi * cutoff, kind, analog=True, output="zpk"))
         )
     if cutoff >= rate / 2:
         raise InputError(
             f"the {kind} filter's cut-off of {cutoff:g} Hz is not below {rate / 2:g} Hz, half of the sampling "
             "rate; lower it, or check the rate."
         )
-    sections = np.asarray(signal.butter(order, cutoff, kind, fs=rate, output="sos"))
+    sections = np.asarray(scipy.signal.butter(order, cutoff, kind, fs=rate, output="sos"))
     return Filter(sections[:, :3], sections[:, 3:], 1.0 / rate)
 
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy import signal
 
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import find_rests
@@ -50,8 +50,8 @@ def find_band(x: Float[np.ndarray, "N C"], period: float) -> tuple[float, float,
     length = int(2 * len(x) / (SEGMENTS + 1))
     if length < 16:
         return None
-    frequency, power = signal.welch(
-        signal.detrend(x, axis=0), 1 / period, "hann", length, axis=0, detrend="linear"
+    frequency, power = scipy.signal.welch(
+        scipy.signal.detrend(x, axis=0), 1 / period, "hann", length, axis=0, detrend="linear"
     )
     power = np.maximum(power.sum(axis=1), 1e-30)
     best = None
