@@ -41,9 +41,9 @@ def bounded_attitude(
     variance = samples.variance + jnp.pad(scale, ((0, 0), (0, 3)))
     rows = Rows(
         rest=(jnp.arange(len(T)) % every == 0) & (T > 0.0),
-        velocity_variance=jnp.asarray(VELOCITY_SD**2),
+        velocity_variance=jnp.full(len(T), VELOCITY_SD**2),
         height=None,
-        height_variance=jnp.asarray(1.0),
+        height_variance=jnp.ones(len(T)),
     )
     tilt, zero, speed = tilt_sd**2, jnp.zeros_like(tilt_sd), velocity_sd**2
     covariance = jnp.diag(jnp.stack([tilt, tilt, zero, zero, zero, zero, speed, speed, speed]))
