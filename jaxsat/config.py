@@ -151,7 +151,7 @@ class Periodic(_Section):
 class Config(_Section):
     """Everything that `estimate` can be told; unknown keys are errors."""
 
-    method: Method = "direct"
+    method: Method = "map"
     gravity: Literal["auto"] | float = Field(
         default="auto", description="magnitude (m/s²); auto: |a| over the first rest"
     )

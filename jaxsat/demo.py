@@ -42,13 +42,13 @@ def run_demo(folder: Path, progress: Progress | None = None) -> str:
 
     Rests and rails are found in the clipped recording itself.
     """
-    results = Path(folder) / "direct"
+    results = Path(folder) / "map"
     check_folder(results)
     walk, time, truth = load_walk()
     clipped = clip_gyroscope(walk, np.deg2rad(RAIL_DPS))
     unclipped = estimate(walk, Config(method="standard"), progress=progress)
     before = estimate(clipped, Config(method="standard"), progress=progress)
-    after = estimate(clipped, Config(method="direct"), progress=progress)
+    after = estimate(clipped, Config(method="map"), progress=progress)
 
     scores = pd.DataFrame(
         {
@@ -56,7 +56,7 @@ def run_demo(folder: Path, progress: Progress | None = None) -> str:
             "3D RMS (m)": [_rms(e, time, truth, 3) for e in (before, after, unclipped)],
         },
         index=pd.Index(
-            ["before: standard smoother", "after: direct", "never clipped"],
+            ["before: standard smoother", "after: map", "never clipped"],
             name="error against motion capture",
         ),
     )

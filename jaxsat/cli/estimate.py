@@ -62,7 +62,7 @@ def estimate_command(
     out: Out,
     method: Annotated[
         str | None,
-        typer.Option(help="standard, direct, triangle, quadratic or map (default: direct)", metavar="NAME"),
+        typer.Option(help="standard, direct, triangle, quadratic or map (default: map)", metavar="NAME"),
     ] = None,
     config: ConfigPath = None,
     format: Format = "auto",
