@@ -78,9 +78,10 @@ def board(tables: dict[str, Table]) -> list[Row]:
                     note,
                 )
             )
-    every = tables["clipped"].set_index(["filter", "trial", "input"]).sort_index()
+    # What was not run in a round has no number.
+    every = tables["clipped"].dropna(subset="total").set_index(["filter", "trial", "input"]).sort_index()
     clipped, peer = every.loc["jaxsat smoothed"], every.loc["VQF offline"]
-    for trial in dict.fromkeys(clipped.index.get_level_values(0)):
+    for trial in clipped.xs("filled", level="input").index:
         total = {word: clipped.loc[(trial, word)]["total"] for word in ("unclipped", "filled")}
         theirs = {word: peer.loc[(trial, word)] for word in ("unclipped", "filled")}
         rows.append(
