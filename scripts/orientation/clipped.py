@@ -13,6 +13,11 @@ from jaxsat.studies.metrics import attitude_errors
 from . import Table, load_trial
 from .peers import vqf
 
+FILTERS = {
+    "jaxsat pi, integral alone": {"orientation.estimate": "pi", "orientation.offset": "integral"},
+    "jaxsat smoothed": {},
+}
+
 
 def clipped_table(c: dict, data: Path) -> Table:
     """Trials whose rates pass the limit: unclipped, clipped and ignored, clipped and filled."""
@@ -31,15 +36,15 @@ def clipped_table(c: dict, data: Path) -> Table:
             "gyr_max": np.rad2deg(np.abs(recording.gyr).max()),
             "saturated": float(np.mean(np.any(beyond, axis=1)[scored])),
         }
-        for estimate in ("pi", "smoothed"):
+        for filter, options in FILTERS.items():
             for label, given, limits in (
                 ("unclipped", recording, {"rails.gyr": "none"}),
                 ("ignored", clipped, {"rails.gyr": "none"}),
                 ("filled", clipped, rails),
             ):
-                found = orient(given, load_config(None, **limits, **{"orientation.estimate": estimate}))
+                found = orient(given, load_config(None, **limits, **options))
                 errors = np.rad2deg(attitude_errors(found.after, q_nb, scored))
-                rows.append({"trial": name, **values, "filter": f"jaxsat {estimate}", "input": label})
+                rows.append({"trial": name, **values, "filter": filter, "input": label})
                 rows[-1] |= dict(zip(("total", "heading", "inclination"), errors, strict=True))
                 if found.sd is not None:
                     rows[-1]["inclination_sd"] = np.rad2deg(np.sqrt(np.mean(found.sd[scored, 0] ** 2)))
