@@ -2,7 +2,7 @@
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all lint bench
+.PHONY: demo test test-all lint bench paper
 demo: $(STAMP)
 	$(VENV)/bin/jaxsat demo
 
@@ -27,3 +27,7 @@ $(STAMP): pyproject.toml
 bench: $(STAMP)
 	$(VENV)/bin/python -m pip install --quiet --editable ".[bench]"
 	$(VENV)/bin/python scripts/bench.py
+
+# The tables and figures of the paper; minutes once compiled programs are in the cache.
+paper: $(STAMP)
+	$(VENV)/bin/python scripts/reproduce_paper.py

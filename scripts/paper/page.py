@@ -15,7 +15,7 @@ from .trials import METHODS, Settings, settings
 
 # The tables of the paper: the experiment, and the column that its error is in.
 TABLES = {"table1": ("bar", "last"), "table2": ("straight", "last"), "table3": ("planar", "distance")}
-WALKS = {"walk": "walk", "walk_saturated": "walk_saturated", "walk_clipped": "walk_clipped"}
+WALKS = ("walk_saturated", "walk_clipped")
 FIGURES = {
     "errors": "error",
     "path": "path",
@@ -34,22 +34,26 @@ def board(out: Path, done: Mapping[str, Settings]) -> Iterator[Row]:
     if "straight_even" in done:
         rows = _read(out, "straight_even")
         yield from _ratios("table2_even", rows, "last", done["straight_even"]["paper"]["last"])
-    for metric, name in WALKS.items():
-        if name not in done:
-            continue
-        rows, paper = _read(out, name), settings("walk")["paper"]["last"]
-        if name == "walk":
-            yield from _ratios(metric, rows, "last", paper)
-            continue
-        for method in METHODS:
-            found = rows[rows["method"] == method]
+    paper = settings("walk")["paper"]["last"]
+    if "walk" in done:
+        yield from _ratios("walk", _read(out, "walk"), "last", paper)
+    for name in (name for name in WALKS if name in done):
+        for method, found in _read(out, name).groupby("method", sort=False):
+            if method == "standard":
+                continue
             ratio = found["last_ratio"]
             note = (
                 f"last position, aligned, against motion capture: median of {len(found)} recordings, "
                 f"{ratio.min():.2f} to {ratio.max():.2f}; RMSE, geometric mean {_mean(found['rmse_ratio']):.2f}"
             )
             yield Row(
-                f"{metric}_{method}", float(ratio.median()), "1", "lower", _ratio(paper, method), None, note
+                f"{name}_{method}",
+                float(ratio.median()),
+                "1",
+                "lower",
+                _ratio(paper, str(method)),
+                None,
+                note,
             )
     if "coverage" in done:
         for row in _read(out, "coverage").to_dict("records"):

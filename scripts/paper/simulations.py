@@ -12,7 +12,6 @@ from .trials import METHODS, Settings, clipped, config_of, elements_of, estimate
 
 MEASURED = ("last", "norm", "path_rmse", "distance", "last_ratio", "norm_ratio", "distance_ratio")
 COLUMNS = [*MEASURED, "fill_rmse_gyr", "fill_rmse_acc", "iterations", "at_bound"]
-CHUNK = 64
 
 
 def values_of(chosen: Settings, rails: dict[str, list[float]], bound: list[float]) -> np.ndarray:
@@ -28,7 +27,7 @@ def table(chosen: Settings, out: Path) -> None:
     trials = elements_of(chosen, chosen["values"])
     bound = config_of(chosen).saturation.gyr_bound
     rails = {sensor: [rail] for sensor, rail in chosen["rails"].items()}
-    rows = summary(score(trials, values_of(chosen, rails, [bound]), CHUNK), [], COLUMNS)
+    rows = summary(score(trials, values_of(chosen, rails, [bound]), chosen["chunk"]), [], COLUMNS)
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
     column, unit = ("distance", "mm") if chosen["motion"]["kind"] == "planar" else ("last", "m")
     drawing.ratios(out / "errors", rows, column, chosen["paper"][column], unit)
@@ -107,6 +106,6 @@ def bound_sweep(chosen: Settings, out: Path) -> None:
 
 def _swept(chosen: Settings, values: np.ndarray, by: str, out: Path) -> pd.DataFrame:
     trials = elements_of(chosen, chosen["values"])
-    rows = summary(score(trials, values, CHUNK), [by], [*MEASURED, "fill_rmse_gyr", "at_bound"])
+    rows = summary(score(trials, values, chosen["chunk"]), [by], [*MEASURED, "fill_rmse_gyr", "at_bound"])
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
     return rows

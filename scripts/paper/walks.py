@@ -21,7 +21,6 @@ from . import drawing
 from .simulations import COLUMNS, values_of
 from .trials import Settings, clipped, config_of, elements_of, estimates, score, summary
 
-CHUNK = 16
 SHOWN = ("standard", "direct", "map")
 
 
@@ -30,7 +29,7 @@ def simulated(chosen: Settings, out: Path) -> None:
     trials = elements_of(chosen, chosen["values"])
     bound = config_of(chosen).saturation.gyr_bound
     values = values_of(chosen, {"gyr": [chosen["rails"]["gyr"]]}, [bound])
-    rows = summary(score(trials, values, CHUNK), [], COLUMNS)
+    rows = summary(score(trials, values, chosen["chunk"]), [], COLUMNS)
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
     drawing.ratios(out / "errors", rows, "last", chosen["paper"]["last"], "m")
     recording, truth, config = clipped(chosen, 0)
