@@ -22,6 +22,7 @@ LABELS = {
     "triangle": "method 2, triangle",
     "quadratic": "method 2, quadratic",
     "map": "map",
+    "unclipped": "never clipped",
 }
 # Okabe and Ito's colours, in steps of lightness too; a line style and a marker each.
 STYLES: dict[str, dict[str, Any]] = {
@@ -32,8 +33,9 @@ STYLES: dict[str, dict[str, Any]] = {
     "triangle": {"color": "#E69F00", "ls": (0, (5, 1.5)), "lw": 1.5},
     "quadratic": {"color": "#009E73", "ls": (0, (4, 1, 1, 1)), "lw": 1.5},
     "map": {"color": "#D55E00", "ls": (0, (2.5, 1)), "lw": 2.0},
+    "unclipped": {"color": "black", "ls": ":", "lw": 1.2},
 }
-MARKERS = {"standard": "X", "direct": "o", "triangle": "^", "quadratic": "s", "map": "D"}
+MARKERS = {"standard": "X", "direct": "o", "triangle": "^", "quadratic": "s", "map": "D", "unclipped": "P"}
 
 plt.rcParams.update(
     {

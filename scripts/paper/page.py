@@ -134,7 +134,7 @@ def _table(rows: pd.DataFrame, chosen: Settings) -> str:
         sensor = "gyr" if row.get("fill_rmse_gyr_median", np.nan) > 0 else "acc"
         cell["filled values, RMS error"] = _number(row[f"fill_rmse_{sensor}_median"])
         cells.append(cell)
-    found = rows[rows["method"] != "standard"]
+    found = rows[rows["method"].isin(METHODS)]
     return _markdown(pd.DataFrame(cells)) + (
         f"\nMedians and 5 to 95 % over {int(found['seeds'].iloc[0])} seeds; {found['saturated'].median():g} values "
         f"saturate; {found['converged'].min():.0%} or more of the searches of each method converged.\n"

@@ -230,20 +230,21 @@ def starts(chosen: Settings, out: Path) -> None:
 
 
 def printed_peak(edges: Edges) -> tuple[Float[Array, "*gaps"], Float[Array, "*gaps"]]:
-    """Eq. 21 as printed: a plus where the difference of slopes belongs, k left out, and t_m counted from zero."""
+    """Eq. 21 with its printed denominator, a sum of slopes; time is counted from k, in the formula's favour."""
     rise = edges.right - edges.left - (edges.h - edges.k) * edges.right_slope
-    time = rise / (edges.left_slope + edges.right_slope)
-    return time, edges.left + time * edges.left_slope
+    after = rise / (edges.left_slope + edges.right_slope)
+    return edges.k + after, edges.left + after * edges.left_slope
 
 
-def gap_edges(signal: Float[np.ndarray, "N"], rail: float) -> Edges:
-    """Of the one gap of a signal that exceeds its rail once."""
-    lost = np.flatnonzero(signal >= rail)
-    k, h = lost[0] - 1, lost[-1] + 1
-    left, right = signal[[k, k - 1, k - 2]], signal[[h, h + 1, h + 2]]
-    slopes = -edge_slope(*left), edge_slope(*right)
-    numbers = (float(value) for value in (k, h, left[0], right[0], *slopes, rail))
-    return Edges(*(np.asarray(number) for number in numbers), sound=np.asarray(True))
+def gap_edges(signals: Float[np.ndarray, "P N"], rails: Float[np.ndarray, "P"]) -> Edges:
+    """Of the one gap of each signal, which exceeds its rail once."""
+    lost = signals >= rails[:, None]
+    k, h = lost.argmax(axis=1) - 1, signals.shape[1] - lost[:, ::-1].argmax(axis=1)
+    row, offset = np.arange(len(rails))[:, None], np.arange(3)[None]
+    left, right = signals[row, k[:, None] - offset].T, signals[row, h[:, None] + offset].T
+    slopes = -edge_slope(*map(jnp.asarray, left)), edge_slope(*map(jnp.asarray, right))
+    given = (jnp.asarray(x, float) for x in (k, h, left[0], right[0]))
+    return Edges(*given, *slopes, jnp.asarray(rails), sound=jnp.ones(len(rails), bool))
 
 
 def eq21(chosen: Settings, out: Path) -> None:
@@ -254,8 +255,7 @@ def eq21(chosen: Settings, out: Path) -> None:
     ]
     recordings = [record(chosen, seed) for seed in range(chosen["seeds"])]
     signals = np.stack([recordings[seed][0].gyr[:, 1] for _, seed in pairs])
-    each = [gap_edges(signal, rail) for signal, (rail, _) in zip(signals, pairs, strict=True)]
-    edges = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    edges = gap_edges(signals, np.array([rail for rail, _ in pairs]))
     top = edges.rail + config_of(chosen).saturation.gyr_bound
     right, printed = peak(edges, top), printed_peak(edges)
     true = np.argmax(recordings[0][1].signal[:, 1])

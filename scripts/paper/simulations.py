@@ -24,14 +24,26 @@ def values_of(chosen: Settings, rails: dict[str, list[float]], bound: list[float
 
 def table(chosen: Settings, out: Path) -> None:
     """A table of the paper: every method over the seeds, and the figures of one of them."""
-    trials = elements_of(chosen, chosen["values"])
+    trials = elements_of(chosen)
     bound = config_of(chosen).saturation.gyr_bound
     rails = {sensor: [rail] for sensor, rail in chosen["rails"].items()}
-    rows = summary(score(trials, values_of(chosen, rails, [bound]), chosen["chunk"]), [], COLUMNS)
+    values = np.concatenate([values_of(chosen, each, [bound]) for each in (rails, {})])
+    rows = summary(beside_unclipped(score(trials, values, chosen["chunk"])), [], COLUMNS)
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
     column, unit = ("distance", "mm") if chosen["motion"]["kind"] == "planar" else ("last", "m")
     drawing.ratios(out / "errors", rows, column, chosen["paper"][column], unit)
     figures(chosen, out)
+
+
+def beside_unclipped(found: pd.DataFrame) -> pd.DataFrame:
+    """The clipped elements, and the standard smoother on what was never clipped as one more method."""
+    whole = np.isinf(found["gyr_rail"]) & np.isinf(found["acc_rail"])
+    clipped = found[~whole]
+    unclipped = found[whole & (found["method"] == "standard")].assign(method="unclipped").set_index("seed")
+    standard = clipped[clipped["method"] == "standard"].set_index("seed")
+    for column in ("last", "norm", "distance"):
+        unclipped[f"{column}_ratio"] = unclipped[column] / standard[column]
+    return pd.concat([clipped, unclipped.reset_index()], ignore_index=True)
 
 
 def figures(chosen: Settings, out: Path) -> None:
@@ -50,7 +62,7 @@ def figures(chosen: Settings, out: Path) -> None:
     unit = "rad/s" if sensor == "gyr" else "m/s²"
     lost = np.flatnonzero(truth.saturated[:, channel])
     way = np.sign(truth.noisy[lost[0], channel])
-    around = truth.time[lost[0]] - 0.12, truth.time[lost[-1]] + 0.12
+    around = float(truth.time[lost[0]]) - 0.12, float(truth.time[lost[-1]]) + 0.12
     drawing.filled(
         out / "filled",
         truth.time,
@@ -105,7 +117,7 @@ def bound_sweep(chosen: Settings, out: Path) -> None:
 
 
 def _swept(chosen: Settings, values: np.ndarray, by: str, out: Path) -> pd.DataFrame:
-    trials = elements_of(chosen, chosen["values"])
+    trials = elements_of(chosen)
     rows = summary(score(trials, values, chosen["chunk"]), [by], [*MEASURED, "fill_rmse_gyr", "at_bound"])
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
     return rows

@@ -1,7 +1,9 @@
 """What the experiments share: settings, simulated trials, their elements against the truth, and summaries."""
 
+import json
 import tomllib
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,13 +48,15 @@ def motion_of(chosen: Settings) -> Motion:
     return MOTIONS[parameters.pop("kind")](**parameters)
 
 
-def record(chosen: Settings, seed: int, **rails: float) -> tuple[Recording, Truth]:
+def record(
+    chosen: Settings, seed: int, gyr_rail: float = np.inf, acc_rail: float = np.inf
+) -> tuple[Recording, Truth]:
     """One noisy recording of its motion, with its true rests."""
     recording, truth = simulate(
         motion_of(chosen),
         rate=chosen["rate"],
         duration=chosen["duration"],
-        sensor=Sensor(**rails),
+        sensor=Sensor(gyr_rail=gyr_rail, acc_rail=acc_rail),
         key=jax.random.fold_in(jax.random.key(chosen["seed"]), seed),
     )
     return replace(recording, rest=truth.rest, name=f"seed {seed}"), truth
@@ -60,8 +64,8 @@ def record(chosen: Settings, seed: int, **rails: float) -> tuple[Recording, Trut
 
 def clipped(chosen: Settings, seed: int) -> tuple[Recording, Truth, Config]:
     """The same as a sensor with its rails records it, and the configuration that knows them."""
-    rails = {f"{sensor}_rail": rail for sensor, rail in chosen["rails"].items()}
-    recording, truth = record(chosen, seed, **rails)
+    rails = (chosen["rails"].get(sensor, np.inf) for sensor in ("gyr", "acc"))
+    recording, truth = record(chosen, seed, *rails)
     return recording, truth, config_of(chosen, rails={"gyr": "none", "acc": "none", **chosen["rails"]})
 
 
@@ -81,15 +85,27 @@ class Elements(NamedTuple):
     config: Config
 
 
-def elements_of(chosen: Settings, values: int) -> Elements:
-    """Recordings of all seeds; a segment of them has at most so many saturated values."""
+def elements_of(chosen: Settings) -> Elements:
+    """Recordings of all seeds; the last ones are kept, since experiments share them."""
+    made_of = {
+        name: chosen[name] for name in ("seed", "seeds", "rate", "duration", "values", "motion", "config")
+    }
+    # Bounds are swept.
+    made_of["config"] = {k: v for k, v in made_of["config"].items() if k != "saturation"}
+    elements = _elements(json.dumps(made_of, sort_keys=True))
+    return elements._replace(config=config_of(chosen, rails={"gyr": "none", "acc": "none"}))
+
+
+@lru_cache(maxsize=1)
+def _elements(made_of: str) -> Elements:
+    chosen = json.loads(made_of)
     config = config_of(chosen, rails={"gyr": "none", "acc": "none"})
     cases = []
     for seed in range(chosen["seeds"]):
         recording, truth = record(chosen, seed)
         cases.append(_against(truth, prepare(recording, config), config))
     longest = int(np.diff(motion_of(chosen).moving, axis=1).max() * chosen["rate"]) + 2
-    sizes = Sizes(bucket(longest, 256), bucket(values, 64))
+    sizes = Sizes(bucket(longest, 256), bucket(chosen["values"], 64))
     return Elements(cases, truth.position[-1], len(truth.time), sizes, config)
 
 
@@ -126,12 +142,12 @@ def score(trials: Elements, values: Float[np.ndarray, "E 4"], chunk: int) -> pd.
     reach = np.sqrt((table[["end_x", "end_y", "end_z"]] ** 2).sum(axis=1))
     table["last"] = table["end_distance"]
     table["norm"] = trials.samples * table["path_rmse"] ** 2
-    table["distance"] = (reach - np.linalg.norm(trials.end)).abs()
+    table["distance"] = np.abs(reach - np.linalg.norm(trials.end))
     keys = ["seed", *SWEPT]
-    standard = table[table["method"] == "standard"].set_index(keys)
-    at = pd.MultiIndex.from_frame(table[keys])
+    standard = table[table["method"] == "standard"]
+    joined = table[keys].merge(standard[[*keys, "last", "norm", "distance"]], on=keys, how="left")
     for column in ("last", "norm", "distance"):
-        table[f"{column}_ratio"] = table[column].to_numpy() / standard[column].reindex(at).to_numpy()
+        table[f"{column}_ratio"] = table[column].to_numpy() / joined[column].to_numpy()
     converged = (Status.CONVERGED, Status.NOTHING_TO_DO)
     table["converged"] = table["status"].isna() | table["status"].isin(converged)
     return table

@@ -18,7 +18,7 @@ from jaxsat.studies.metrics import (
 )
 
 from . import drawing
-from .simulations import COLUMNS, values_of
+from .simulations import COLUMNS, beside_unclipped, values_of
 from .trials import Settings, clipped, config_of, elements_of, estimates, score, summary
 
 SHOWN = ("standard", "direct", "map")
@@ -26,10 +26,11 @@ SHOWN = ("standard", "direct", "map")
 
 def simulated(chosen: Settings, out: Path) -> None:
     """A simulated walk: every method over the seeds."""
-    trials = elements_of(chosen, chosen["values"])
+    trials = elements_of(chosen)
     bound = config_of(chosen).saturation.gyr_bound
-    values = values_of(chosen, {"gyr": [chosen["rails"]["gyr"]]}, [bound])
-    rows = summary(score(trials, values, chosen["chunk"]), [], COLUMNS)
+    rails = {"gyr": [chosen["rails"]["gyr"]]}
+    values = np.concatenate([values_of(chosen, each, [bound]) for each in (rails, {})])
+    rows = summary(beside_unclipped(score(trials, values, chosen["chunk"])), [], COLUMNS)
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
     drawing.ratios(out / "errors", rows, "last", chosen["paper"]["last"], "m")
     recording, truth, config = clipped(chosen, 0)
@@ -90,7 +91,7 @@ def _scored(name: str, found: dict[str, Estimate], positions: drawing.Tracks, tr
 def _against_standard(table: pd.DataFrame) -> pd.DataFrame:
     standard = table[table["method"] == "standard"].set_index("trial")
     for column in ("last", "rmse"):
-        table[f"{column}_ratio"] = table[column] / table["trial"].map(standard[column])
+        table[f"{column}_ratio"] = table[column] / standard.loc[table["trial"], column].to_numpy()
     return table
 
 
