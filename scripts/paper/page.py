@@ -26,6 +26,18 @@ FIGURES = {
 }
 
 
+_HEAD = """# The paper, reproduced
+
+Q. K. Dang and Y. S. Suh, *Sensor Saturation Compensated Smoothing Algorithm for Inertial Sensor Based Motion Tracking*, Sensors
+2014, 14(5), 8167-8188: its tables and figures, by `python scripts/reproduce_paper.py`. All ratios are in `board.md`.
+
+The paper's recordings are not public, and it does not say enough of its simulation to repeat it; what can be compared is the
+ratio of a compensated to the standard error. What was chosen stands with each experiment. `map` is not of the paper.
+Simulations have no bias, scale error or misalignment. "Never clipped" is the standard smoother on the same recording before
+it was clipped: what noise alone costs.
+"""
+
+
 def board(out: Path, done: Mapping[str, Settings]) -> Iterator[Row]:
     """Ratios of compensated to standard errors, with the paper's as goals; then what the paper does not have."""
     for metric, (name, column) in TABLES.items():
@@ -93,7 +105,8 @@ def _read(out: Path, name: str) -> pd.DataFrame:
 
 def page(out: Path, done: Mapping[str, Settings]) -> str:
     """The page of all experiments: what the paper leaves open, its values beside ours, and the figures."""
-    parts = [(out / "notes.md").read_text() if (out / "notes.md").exists() else "# The paper, reproduced\n"]
+    notes = out / "notes.md"
+    parts = [_HEAD, *([notes.read_text()] if notes.exists() else [])]
     for name, chosen in done.items():
         parts.append(f"## {chosen['title']}\n")
         parts.append(f"{chosen['about'].strip()}\n")
