@@ -28,13 +28,14 @@ FIGURES = {
 
 _HEAD = """# The paper, reproduced
 
-Q. K. Dang and Y. S. Suh, *Sensor Saturation Compensated Smoothing Algorithm for Inertial Sensor Based Motion Tracking*, Sensors
-2014, 14(5), 8167-8188: its tables and figures, by `python scripts/reproduce_paper.py`. All ratios are in `board.md`.
+Q. K. Dang and Y. S. Suh, *Sensor Saturation Compensated Smoothing Algorithm for Inertial Sensor Based Motion
+Tracking*, Sensors 2014, 14(5), 8167-8188: its tables and figures, by `python scripts/reproduce_paper.py`. All ratios
+are in `board.md`.
 
-The paper's recordings are not public, and it does not say enough of its simulation to repeat it; what can be compared is the
-ratio of a compensated to the standard error. What was chosen stands with each experiment. `map` is not of the paper.
-Simulations have no bias, scale error or misalignment. "Never clipped" is the standard smoother on the same recording before
-it was clipped: what noise alone costs.
+The paper's recordings are not public, and it does not say enough of its simulation to repeat it; what can be compared
+is the ratio of a compensated to the standard error. What was chosen stands with each experiment. `map` is not of the
+paper. Simulations have no bias, scale error or misalignment. "Never clipped" is the standard smoother on the same
+recording before it was clipped: what noise alone costs.
 """
 
 
