@@ -2,7 +2,7 @@
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all lint bench board
+.PHONY: demo test test-all lint bench board paper
 demo: $(STAMP)
 	$(VENV)/bin/jaxsat demo
 
@@ -32,3 +32,7 @@ bench: $(STAMP)
 DATA := ../shared/data
 board: $(STAMP)
 	$(VENV)/bin/python scripts/accuracy.py $(DATA)
+
+# The tables and figures of the paper; minutes once compiled programs are in the cache.
+paper: $(STAMP)
+	$(VENV)/bin/python scripts/reproduce_paper.py

@@ -100,12 +100,12 @@ def orient(recording: Recording, config: Config | None = None) -> Orientation:
         trusted = ~np.any((saturated | recording.missing).reshape(-1, 2, 3), axis=2)
         rest = np.zeros(len(recording), bool)
         if settings.offset == "rests":
-            rest = _rests(recording, np.asarray(start.offset), saturated.any(axis=1))
+            rest = _rests(recording, np.asarray(start.offset), np.any(saturated, axis=1))
         padded = _padded(filled, period, trusted, rest)
         if moving:
             start = _start_in_motion(*padded, start, gains)
         smoothed = settings.estimate == "smoothed"
-        estimate = "pi" if smoothed else settings.estimate
+        estimate = "pi" if settings.estimate == "smoothed" else settings.estimate
         found = _filter(
             *padded[:3], start, gains, rest=padded[3], estimate=estimate, update=settings.update,
             direction=settings.direction,
@@ -219,12 +219,15 @@ def _filled(
     return np.concatenate([rates.signal, recording.acc], axis=1), variance
 
 
-def _padded(signal: Float[np.ndarray, "N 6"], period: float, trusted, rest):
+def _padded(
+    signal: Float[np.ndarray, "N 6"], period: float, trusted, rest
+) -> tuple[Array, Array, Array, Array]:
     size = max(_SHORTEST, 1 << (len(signal) - 1).bit_length())
     extra = (0, size - len(signal))
     rows = (extra, (0, 0))
     blank = (signal, rows), (np.full(len(signal), period), extra), (trusted, rows), (rest, extra)
-    return tuple(jnp.asarray(np.pad(x, width)) for x, width in blank)
+    values, periods, trusted, rest = (jnp.asarray(np.pad(x, width)) for x, width in blank)
+    return values, periods, trusted, rest
 
 
 @eqx.filter_jit

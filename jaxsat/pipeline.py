@@ -310,9 +310,9 @@ def _attitude_before(signal, trusted, period: float, rest: Start, config: Config
     """Attitude at the first of the samples before a rest."""
     # Blank samples before the first turn nothing; lengths that are about the same share a program.
     blank = ((-len(signal) % 4096, 0), (0, 0))
-    periods = np.pad(np.full(len(signal), period), blank[0])
-    gains = given_gains(config)
-    return _backward(np.pad(signal, blank), periods, np.pad(trusted, blank), rest, gains).q_nb[0]
+    periods = jnp.asarray(np.pad(np.full(len(signal), period), blank[0]))
+    values, trusted = jnp.asarray(np.pad(signal, blank)), jnp.asarray(np.pad(trusted, blank))
+    return _backward(values, periods, trusted, rest, given_gains(config)).q_nb[0]
 
 
 _backward = eqx.filter_jit(backward)

@@ -126,6 +126,14 @@ def test_the_line_is_as_long_as_told_and_saturates_x_only(key):
     assert np.abs(truth.signal[:, 3]).max() == pytest.approx(9.4 * 0.95 / 0.8**2, rel=0.01)
 
 
+def test_a_hasty_line_is_pushed_harder_than_braked(key):
+    motion = Line(duration=1.0, haste=0.5)
+    _, truth = simulate(motion, rate=400.0, duration=2.0, sensor=SILENT, key=key)
+    np.testing.assert_allclose(truth.position[-1], [0.95, 0.0, 0.0], atol=1e-14)
+    assert truth.signal[:, 3].max() == pytest.approx(14.3 * 0.95, rel=0.01)
+    assert truth.signal[:, 3].min() == pytest.approx(-10.1 * 0.95, rel=0.01)
+
+
 def test_the_planar_curve_starts_and_stops_and_saturates_rate_z_only(key):
     _, truth = simulate(Planar(), rate=100.0, duration=2.5, sensor=Sensor(gyr_rail=7.5), key=key)
     np.testing.assert_allclose(truth.position[-1], [0.5, 0.0, 0.0], atol=1e-14)

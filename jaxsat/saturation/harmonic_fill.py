@@ -101,7 +101,7 @@ def _with_gaps(windows: Windows, measured: Bool[np.ndarray, "N"]) -> Windows:
 
     In all a power of two where there are so many: channels and recordings then share compiled programs.
     """
-    gaps = ~windows.of(measured).all(axis=1)
+    gaps = ~np.all(windows.of(measured), axis=1)
     count = min(len(gaps), 1 << int(gaps.sum() + CLEAN - 1).bit_length())
     clean = np.flatnonzero(~gaps)
     drawn = clean[np.linspace(0, len(clean) - 1, count - gaps.sum()).astype(int)] if len(clean) else clean
