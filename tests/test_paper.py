@@ -12,6 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+# The program alone is minutes of compiling.
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = ("direct", "triangle", "quadratic", "map")
 
@@ -131,7 +134,6 @@ def test_equation_21_as_printed_puts_peaks_outside_their_gaps(run):
     assert table.loc["corrected", "time_median"].abs().max() < 2.0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["walk_clipped", "walk_saturated"])
 def test_figure_16_on_real_walks(run, name, request):
     if name == "walk_saturated":
