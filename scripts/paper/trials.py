@@ -28,6 +28,9 @@ METHODS = ("direct", "triangle", "quadratic", "map")
 SWEPT = ("gyr_rail", "acc_rail", "gyr_bound", "acc_bound")
 QUANTILES = (0.05, 0.5, 0.95)
 
+# Of the simulated sensor, a good MEMS, and what the smoother is told of it.
+NOISE = {"gyr_density": 7e-4, "acc_density": 7e-3}
+
 Settings = dict[str, Any]
 
 
@@ -39,8 +42,9 @@ def settings(name: str, quick: bool = False) -> Settings:
 
 
 def config_of(chosen: Settings, **changes: Any) -> Config:
-    """Its configuration, with some sections changed: `rails={"gyr": 5.0}`."""
-    return Config.model_validate({**chosen["config"], **changes})
+    """Its configuration for simulated recordings, with some sections changed: `rails={"gyr": 5.0}`."""
+    noise = {**NOISE, "rest_velocity_sd": 0.01}
+    return Config.model_validate({"noise": noise, **chosen["config"], **changes})
 
 
 def motion_of(chosen: Settings) -> Motion:
@@ -56,7 +60,7 @@ def record(
         motion_of(chosen),
         rate=chosen["rate"],
         duration=chosen["duration"],
-        sensor=Sensor(gyr_rail=gyr_rail, acc_rail=acc_rail),
+        sensor=Sensor(gyr_rail=gyr_rail, acc_rail=acc_rail, **NOISE),
         key=jax.random.fold_in(jax.random.key(chosen["seed"]), seed),
     )
     return replace(recording, rest=truth.rest, name=f"seed {seed}"), truth

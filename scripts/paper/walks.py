@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from jaxsat.config import Config
 from jaxsat.demo import clip_gyroscope, load_walk
 from jaxsat.pipeline import Estimate
 from jaxsat.signals.readers import read
@@ -47,7 +48,7 @@ def saturated(chosen: Settings, out: Path, data: Path) -> None:
     for name in names:
         recording = read(folder / f"{name}.mat")
         _, truth = load_pyshoe_truth(folder / f"{name}.mat", at=recording.time)
-        found = estimates(recording, config_of(chosen), ("standard", *chosen["methods"]))
+        found = estimates(recording, Config(**chosen["config"]), ("standard", *chosen["methods"]))
         positions = {m: e.trajectory.position for m, e in found.items()}
         rows += _scored(name, found, positions, truth)
         if name == chosen["drawn"]:
@@ -61,7 +62,7 @@ def software(chosen: Settings, out: Path) -> None:
     rows, positions = [], {}
     for rail in chosen["rails_dps"]:
         recording = clip_gyroscope(walk, np.deg2rad(rail))
-        found = estimates(recording, config_of(chosen), ("standard", *chosen["methods"]))
+        found = estimates(recording, Config(**chosen["config"]), ("standard", *chosen["methods"]))
         positions = {m: _at(e, time) for m, e in found.items()}
         rows += _scored(f"{rail:g} °/s", found, positions, truth)
         if rail == chosen["drawn"]:
