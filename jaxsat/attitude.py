@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
 from jaxsat.errors import InputError
-from jaxsat.inertial.bounded import ROW_EVERY, bounded_attitude
+from jaxsat.inertial.bounded import ACC_DENSITY, GYR_DENSITY, ROW_EVERY, bounded_attitude
 from jaxsat.inertial.good_gain import good_gain
 from jaxsat.inertial.orientation import (
     Gains,
@@ -206,8 +206,8 @@ def _filled(
     recording: Recording, config: Config, sign: Int[np.ndarray, "N 6"]
 ) -> tuple[Float[np.ndarray, "N 6"], Float[np.ndarray, "N 6"]]:
     """The channels with saturated rates filled, and the noise variance of each value."""
-    T, noise, limits = recording.period, config.noise, config.saturation
-    density = np.repeat([noise.gyr_density, noise.acc_density], 3) ** 2 / T
+    T, limits = recording.period, config.saturation
+    density = np.repeat([GYR_DENSITY, ACC_DENSITY], 3) ** 2 / T
     # What was not measured may be anything that the channel did, what saturates anything within its bounds.
     variance = np.where(recording.missing, np.maximum(recording.signal.var(axis=0), density), density)
     bound = np.repeat([limits.gyr_bound, limits.acc_bound], 3)
@@ -255,7 +255,7 @@ def _smooth(
     q_nb, variance = _bounded(samples, start, *numbers)
     variance = np.array(variance)[: len(rest)]
     # The offset, known from a second at rest, is off by the same until the next rest.
-    offset = LEFT_OFFSET_SD if moving else config.noise.gyr_density / np.sqrt(FIRST)
+    offset = LEFT_OFFSET_SD if moving else GYR_DENSITY / np.sqrt(FIRST)
     for i, j in zip(*runs(~rest), strict=True):
         variance[i:j, 1] += (offset * T * np.arange(j - i)) ** 2
         variance[j:, 1] += (offset * T * (j - i)) ** 2

@@ -18,6 +18,8 @@ VELOCITY_SD = 1.0
 """Of a hand, a tool or a limb that goes nowhere (m/s)."""
 ROW_EVERY = 0.1
 """From row to row (s): velocities of such a motion are about independent."""
+GYR_DENSITY, ACC_DENSITY = 7e-4, 7e-3
+"""Noise of the sensors alone (rad/s/√Hz, m/s²/√Hz); `config.Noise` also holds what their scale does, here apart."""
 SCALE, SWING = 0.005, 0.3
 """A calibrated gyroscope's error as a share of the rate, and how long a movement turns one way (s)."""
 
