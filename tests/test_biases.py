@@ -116,7 +116,9 @@ def biased_walk():
     duration = float(motion.moving[-1, 1]) + 1.0
     recording, truth = simulate(motion, rate=100.0, duration=duration, sensor=sensor, key=jax.random.key(2))
     recording = eqx.tree_at(lambda r: r.rest, recording, truth.rest, is_leaf=lambda x: x is None)
-    settings = {"smoother.gyr_offset": "none", "gravity": 9.80665, "rails.gyr": "none", "rails.acc": "none"}
+    noise = {"gyr_density": sensor.gyr_density, "acc_density": sensor.acc_density, "rest_velocity_sd": 0.01}
+    settings = {f"noise.{name}": value for name, value in noise.items()}
+    settings |= {"smoother.gyr_offset": "none", "gravity": 9.80665, "rails.gyr": "none", "rails.acc": "none"}
     return jax.tree.map(jnp.asarray, prepare(recording, load_config(None, **settings)).trial)
 
 

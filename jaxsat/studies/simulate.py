@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxsat.config import Noise
 from jaxsat.errors import InputError
 from jaxsat.inertial.rotations import quat_conjugate, quat_multiply, quat_rotate
 from jaxsat.signals.recording import CHANNELS, Recording
@@ -22,7 +21,6 @@ from jaxsat.studies.motions import Motion
 GRAVITY = 9.80665
 # Samples are differentiated in chunks of one size: one compilation per kind of motion, whatever the length.
 _CHUNK = 1024
-_NOISE = Noise()
 
 
 def _floats(value) -> np.ndarray:
@@ -50,9 +48,9 @@ class Sensor(eqx.Module):
     Signals are calibrated ones (noise and bias included); rails belong to the raw values before calibration.
     """
 
-    gyr_density: float = _NOISE.gyr_density
-    """Angular-rate noise density (rad/s/√Hz)."""
-    acc_density: float = _NOISE.acc_density
+    gyr_density: float = 7e-4
+    """Angular-rate noise density of a consumer sensor (rad/s/√Hz)."""
+    acc_density: float = 7e-3
     """Specific-force noise density (m/s²/√Hz)."""
     gyr_bias: Float[np.ndarray, "3"] = eqx.field(default_factory=_zeros, converter=_floats)
     """rad/s"""

@@ -28,9 +28,6 @@ METHODS = ("direct", "triangle", "quadratic", "map")
 SWEPT = ("gyr_rail", "acc_rail", "gyr_bound", "acc_bound")
 QUANTILES = (0.05, 0.5, 0.95)
 
-# Of the simulated sensor, a good MEMS, and what the smoother is told of it.
-NOISE = {"gyr_density": 7e-4, "acc_density": 7e-3}
-
 Settings = dict[str, Any]
 
 
@@ -43,7 +40,9 @@ def settings(name: str, quick: bool = False) -> Settings:
 
 def config_of(chosen: Settings, **changes: Any) -> Config:
     """Its configuration for simulated recordings, with some sections changed: `rails={"gyr": 5.0}`."""
-    noise = {**NOISE, "rest_velocity_sd": 0.01}
+    # The smoother is told the noise of the sensor.
+    sensor = Sensor()
+    noise = {"gyr_density": sensor.gyr_density, "acc_density": sensor.acc_density, "rest_velocity_sd": 0.01}
     return Config.model_validate({"noise": noise, **chosen["config"], **changes})
 
 
@@ -60,7 +59,7 @@ def record(
         motion_of(chosen),
         rate=chosen["rate"],
         duration=chosen["duration"],
-        sensor=Sensor(gyr_rail=gyr_rail, acc_rail=acc_rail, **NOISE),
+        sensor=Sensor(gyr_rail=gyr_rail, acc_rail=acc_rail),
         key=jax.random.fold_in(jax.random.key(chosen["seed"]), seed),
     )
     return replace(recording, rest=truth.rest, name=f"seed {seed}"), truth
