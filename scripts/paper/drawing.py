@@ -107,7 +107,7 @@ def swing(path: Path, time: Float[np.ndarray, "N"], tracks: Tracks) -> None:
     space: Any = figure.add_subplot(1, 2, 1, projection="3d")
     panel = figure.add_subplot(1, 2, 2)
     for name, track in tracks.items():
-        line(space, *track.T, name)
+        space.plot(*track.T, label=LABELS[name], **STYLES[name])
         if name != "truth":
             line(panel, time, np.linalg.norm(track - tracks["truth"], axis=1), name)
     reach = max(np.ptp(tracks["truth"][:, i]) for i in range(3)) / 2
@@ -169,10 +169,8 @@ def ratios(path: Path, rows: pd.DataFrame, column: str, paper: Mapping[str, floa
         panel.plot(middle, place, MARKERS[method], color=STYLES[method]["color"], ms=7)
         if method in paper:
             panel.plot(scale * paper[method], place, "k|", ms=16, mew=2)
-    (
-        panel.plot([], [], "ko", label="ours, median"),
-        panel.plot([], [], "k-", lw=5, alpha=0.4, label="5 to 95 %"),
-    )
+    panel.plot([], [], "ko", label="ours, median")
+    panel.plot([], [], "k-", lw=5, alpha=0.4, label="5 to 95 %")
     panel.plot([], [], "k|", ms=12, mew=2, label="the paper")
     panel.set_yticks(range(len(methods)), [LABELS[m] for m in reversed(methods)])
     panel.set(xscale="log", xlabel=f"error ({unit})")
