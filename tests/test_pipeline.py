@@ -59,9 +59,10 @@ def test_bar_of_the_paper_is_compensated_at_least_as_well_as_in_table_1(method):
     assert np.median(ratios) <= PAPER[method]
 
 
-def test_filled_signal_lies_beyond_the_rail_and_near_the_truth():
+@pytest.mark.parametrize("method", ["map", pytest.param("quadratic", marks=pytest.mark.slow)])
+def test_filled_signal_lies_beyond_the_rail_and_near_the_truth(method):
     recording, truth = bar(3, gyr_rail=7.5)
-    found = estimate(recording, load_config(None, method="map", **BAR))
+    found = estimate(recording, load_config(None, method=method, **BAR))
     where = truth.saturated
     assert (found.saturated == where).all() and where.sum() == 22
     added = (found.filled - recording.signal)[where] * found.sign[where]

@@ -6,13 +6,33 @@ from typing import Annotated
 
 import typer
 
-# Imported for the commands that they add, in the order of the help.
-from jaxsat.cli import estimate, orientation, periodic, sweep, simulate  # noqa: F401 isort: skip
-from jaxsat.cli.shared import app
+from jaxsat.cli.estimate import estimate_command, inspect_command
+from jaxsat.cli.orientation import orientation_command
+from jaxsat.cli.periodic import periodic_command
+from jaxsat.cli.simulate import demo_command, simulate_command
+from jaxsat.cli.sweep import sweep_command
 from jaxsat.errors import InputError
 
 # What typer raises for wrong arguments; where it lives changed between versions.
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+
+app = typer.Typer(
+    name="jaxsat",
+    help="Trajectories from inertial recordings that saturated.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+for _name, _command in (
+    ("inspect", inspect_command),
+    ("estimate", estimate_command),
+    ("orientation", orientation_command),
+    ("periodic", periodic_command),
+    ("sweep", sweep_command),
+    ("simulate", simulate_command),
+    ("demo", demo_command),
+):
+    app.command(_name)(_command)
 
 
 @app.callback(invoke_without_command=True)

@@ -21,7 +21,6 @@ from jaxsat.cli.shared import (
     RestColumn,
     SensorName,
     Strict,
-    app,
     progress_bar,
     rail_overrides,
     read_recording,
@@ -30,7 +29,6 @@ from jaxsat.cli.shared import (
 )
 
 
-@app.command("inspect")
 def inspect_command(
     recording: RecordingPath,
     config: ConfigPath = None,
@@ -56,7 +54,6 @@ def inspect_command(
     typer.echo(json.dumps(found, indent=2, allow_nan=False) if as_json else inspection_text(found))
 
 
-@app.command("estimate")
 def estimate_command(
     recording: RecordingPath,
     out: Out,

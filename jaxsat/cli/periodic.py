@@ -19,7 +19,6 @@ from jaxsat.cli.shared import (
     RecordingPath,
     SensorName,
     Strict,
-    app,
     rail_overrides,
     read_recording,
     tell,
@@ -27,7 +26,6 @@ from jaxsat.cli.shared import (
 )
 
 
-@app.command("periodic")
 def periodic_command(
     recording: RecordingPath,
     out: Out,

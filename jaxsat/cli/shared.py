@@ -11,14 +11,6 @@ import typer
 
 from jaxsat.errors import InputError
 
-app = typer.Typer(
-    name="jaxsat",
-    help="Trajectories from inertial recordings that saturated.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="file with the recording")]
 Format = Annotated[
     str, typer.Option(help="format of the recording; auto looks at its content", metavar="NAME")

@@ -5,11 +5,10 @@ from typing import Annotated
 
 import typer
 
-from jaxsat.cli.shared import app, progress_bar, use_compilation_cache
+from jaxsat.cli.shared import progress_bar, use_compilation_cache
 from jaxsat.errors import InputError
 
 
-@app.command("simulate")
 def simulate_command(
     motion: Annotated[str, typer.Argument(metavar="MOTION", help="bar, joint, line, planar or walk")],
     out: Annotated[Path, typer.Option("--out", "-o", help="FILE.csv or FILE.parquet", metavar="FILE")],
@@ -54,7 +53,6 @@ def simulate_command(
     typer.echo(f"{out}: {len(recording)} samples, {saturated} saturated values; truth: {truth_path}")
 
 
-@app.command("demo")
 def demo_command(
     out: Annotated[Path, typer.Option("--out", "-o", help="folder for the results", metavar="DIR")] = Path(
         "jaxsat-demo"

@@ -18,7 +18,6 @@ from jaxsat.cli.shared import (
     Rate,
     RestColumn,
     SensorName,
-    app,
     limit,
     progress_bar,
     read_recording,
@@ -31,7 +30,6 @@ _CLIP = "limit to clip at: none or a magnitude as for estimate; repeatable"
 Rails = Annotated[list[str] | None, typer.Option(help=_CLIP, metavar="VALUE")]
 
 
-@app.command("sweep")
 def sweep_command(
     recordings: Annotated[
         list[Path], typer.Argument(metavar="RECORDING...", help="files with recordings, one trial each")

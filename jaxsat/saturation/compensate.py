@@ -136,7 +136,7 @@ def solve_segments(
     options: Options,
 ) -> tuple[SegmentFill, Values]:
     """Some segments of a recording side by side, from the filtered states at their departures."""
-    prior = _signal_prior(trial) if options.method == "map" else None
+    prior = signal_prior(trial) if options.method == "map" else None
 
     def solve(state, covariance, table, departure, arrival):
         segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
@@ -156,7 +156,7 @@ def judge_segments(
     sizes: Sizes,
 ) -> tuple[Uncertainty, Values]:
     """How well what `map` found for them is known; the arguments of `solve_segments`, and its δ."""
-    prior = _signal_prior(trial)
+    prior = signal_prior(trial)
 
     def judge(state, covariance, table, departure, arrival, delta):
         segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
@@ -165,7 +165,7 @@ def judge_segments(
     return jax.vmap(judge)(states, covariances, table, departure, arrival, delta)
 
 
-def _signal_prior(trial: Trial) -> SignalPrior:
+def signal_prior(trial: Trial) -> SignalPrior:
     moving = ~jnp.asarray(trial.rows.rest)
     signal, sign, clean = map(jnp.asarray, (trial.signal, trial.sign, trial.clean))
     return learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0])

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import matplotlib
 import numpy as np
@@ -192,7 +192,7 @@ def bands(
     """Figures 9 to 11: an error against a rail or bound; median over the seeds, and 5 to 95 % as a band."""
     figure, (panel,) = panels(1, 1, 6.5, 3.8)
     for method in methods:
-        mine = rows[rows["method"] == method].sort_values(x)
+        mine = rows.loc[rows["method"] == method].sort_values(x)
         line(panel, mine[x], mine[f"{column}_median"], method)
         panel.fill_between(
             mine[x],
@@ -226,9 +226,10 @@ def orders(path: Path, table: pd.DataFrame) -> None:
         axes, ("last", "seconds"), ("last-position error (m)", "time for all segments (s)"), strict=True
     ):
         places = []
-        for place, ((order, method), rows) in enumerate(table.groupby(["order", "method"], sort=False)):
-            places.append(f"{LABELS[str(method)]},\n{order}")
-            face = STYLES[str(method)]["color"] if order == "parallel" else "white"
+        for place, (key, rows) in enumerate(table.groupby(["order", "method"], sort=False)):
+            order, method = cast(tuple[str, str], key)
+            places.append(f"{LABELS[method]},\n{order}")
+            face = STYLES[method]["color"] if order == "parallel" else "white"
             panel.plot(
                 np.full(len(rows), place),
                 rows[column],

@@ -54,14 +54,14 @@ def board(out: Path, done: Mapping[str, Settings]) -> Iterator[Row]:
         for method, found in _read(out, name).groupby("method", sort=False):
             if method == "standard":
                 continue
-            ratio = found["last_ratio"]
+            ratio, rmse = (found[column].to_numpy() for column in ("last_ratio", "rmse_ratio"))
             note = (
                 f"last position, aligned, against motion capture: median of {len(found)} recordings, "
-                f"{ratio.min():.2f} to {ratio.max():.2f}; RMSE, geometric mean {_mean(found['rmse_ratio']):.2f}"
+                f"{ratio.min():.2f} to {ratio.max():.2f}; RMSE, geometric mean {_mean(rmse):.2f}"
             )
             yield Row(
                 f"{name}_{method}",
-                float(ratio.median()),
+                float(np.median(ratio)),
                 "1",
                 "lower",
                 _ratio(paper, str(method)),
@@ -96,7 +96,7 @@ def _ratio(paper: Mapping[str, float], method: str) -> float:
     return round(min(ours) / paper["standard"], 3)
 
 
-def _mean(ratios: pd.Series) -> float:
+def _mean(ratios: pd.Series | np.ndarray) -> float:
     return float(np.exp(np.log(ratios).mean()))
 
 
@@ -148,7 +148,7 @@ def _table(rows: pd.DataFrame, chosen: Settings) -> str:
         sensor = "gyr" if row.get("fill_rmse_gyr_median", np.nan) > 0 else "acc"
         cell["filled values, RMS error"] = _number(row[f"fill_rmse_{sensor}_median"])
         cells.append(cell)
-    found = rows[rows["method"].isin(METHODS)]
+    found = rows.loc[rows["method"].isin(METHODS)]
     return _markdown(pd.DataFrame(cells)) + (
         f"\nMedians and 5 to 95 % over {int(found['seeds'].iloc[0])} seeds; {found['saturated'].median():g} values "
         f"saturate; {found['converged'].min():.0%} or more of the searches of each method converged.\n"
@@ -156,7 +156,9 @@ def _table(rows: pd.DataFrame, chosen: Settings) -> str:
 
 
 def _trials(rows: pd.DataFrame) -> str:
-    wide = rows.pivot(index="trial", columns="method", values="last")[list(dict.fromkeys(rows["method"]))]
+    wide = rows.pivot(index="trial", columns="method", values="last").loc[
+        :, list(dict.fromkeys(rows["method"]))
+    ]
     wide = wide.rename(columns=LABELS).map(_number)
     ratio = rows.groupby("method", sort=False).agg(
         last=("last_ratio", "median"), worst=("last_ratio", "max"), rmse=("rmse_ratio", _mean)

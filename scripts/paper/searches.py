@@ -14,10 +14,9 @@ from jaxsat.config import Config
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import Prepared, estimate, prepare, search_options
-from jaxsat.saturation.compensate import arrival_table, filter_trial
+from jaxsat.saturation.compensate import arrival_table, filter_trial, signal_prior
 from jaxsat.saturation.gap_shapes import Edges, edge_slope, peak, shape_value
 from jaxsat.saturation.layout import Sizes, Trial, gather
-from jaxsat.saturation.prior import learn
 from jaxsat.saturation.segment import Condensed, Segment, condense, value_gradient_root
 from jaxsat.saturation.solvers import Box, projected_gauss_newton, projected_gradient
 from jaxsat.signals.recording import Recording
@@ -120,9 +119,7 @@ def _gathered(trial: Trial, departure, arrival, table, learned: bool) -> tuple[S
     trial = jax.tree.map(jnp.asarray, trial)
     states, covariances = filter_trial(trial, trial.signal, trial.unfilled_variance)
     state, covariance = jax.tree.map(lambda x: x[departure], (states, covariances))
-    known = None
-    if learned:
-        known = learn(trial.signal, trial.sign, trial.clean, ~trial.rows.rest, trial.period[0])
+    known = signal_prior(trial) if learned else None
     segment, _ = gather(trial, departure, arrival, state, covariance, table, SIZES, known)
     return segment, condense(segment)
 
@@ -176,7 +173,7 @@ def iterations(chosen: Settings, out: Path) -> None:
     table = pd.DataFrame(rows)
     table["best"] = table.groupby(["method", "solver"])["cost"].cummin()
     # A long tail that lowers nothing tells nothing.
-    table = table[
+    table = table.loc[
         (table["best"] != table.groupby(["method", "solver"])["best"].shift()) | (table["evaluation"] == 0)
     ]
     table.to_csv(out / "table.csv", index=False, float_format="%.9g")
@@ -243,8 +240,9 @@ def gap_edges(signals: Float[np.ndarray, "P N"], rails: Float[np.ndarray, "P"]) 
     row, offset = np.arange(len(rails))[:, None], np.arange(3)[None]
     left, right = signals[row, k[:, None] - offset].T, signals[row, h[:, None] + offset].T
     slopes = -edge_slope(*map(jnp.asarray, left)), edge_slope(*map(jnp.asarray, right))
-    given = (jnp.asarray(x, float) for x in (k, h, left[0], right[0]))
-    return Edges(*given, *slopes, jnp.asarray(rails), sound=jnp.ones(len(rails), bool))
+    begin, end, first, last = (jnp.asarray(x, float) for x in (k, h, left[0], right[0]))
+    sound = jnp.ones(len(rails), bool)
+    return Edges(begin, end, first, last, *slopes, jnp.asarray(rails), sound)
 
 
 def eq21(chosen: Settings, out: Path) -> None:

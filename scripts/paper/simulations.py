@@ -38,9 +38,11 @@ def table(chosen: Settings, out: Path) -> None:
 def beside_unclipped(found: pd.DataFrame) -> pd.DataFrame:
     """The clipped elements, and the standard smoother on what was never clipped as one more method."""
     whole = np.isinf(found["gyr_rail"]) & np.isinf(found["acc_rail"])
-    clipped = found[~whole]
-    unclipped = found[whole & (found["method"] == "standard")].assign(method="unclipped").set_index("seed")
-    standard = clipped[clipped["method"] == "standard"].set_index("seed")
+    clipped = found.loc[~whole]
+    unclipped = (
+        found.loc[whole & (found["method"] == "standard")].assign(method="unclipped").set_index("seed")
+    )
+    standard = clipped.loc[clipped["method"] == "standard"].set_index("seed")
     for column in ("last", "norm", "distance"):
         unclipped[f"{column}_ratio"] = unclipped[column] / standard[column]
     return pd.concat([clipped, unclipped.reset_index()], ignore_index=True)

@@ -147,7 +147,7 @@ def score(trials: Elements, values: Float[np.ndarray, "E 4"], chunk: int) -> pd.
     table["norm"] = trials.samples * table["path_rmse"] ** 2
     table["distance"] = np.abs(reach - np.linalg.norm(trials.end))
     keys = ["seed", *SWEPT]
-    standard = table[table["method"] == "standard"]
+    standard = table.loc[table["method"] == "standard"]
     joined = table[keys].merge(standard[[*keys, "last", "norm", "distance"]], on=keys, how="left")
     for column in ("last", "norm", "distance"):
         table[f"{column}_ratio"] = table[column].to_numpy() / joined[column].to_numpy()
