@@ -4,7 +4,10 @@ import os
 from pathlib import Path
 
 # Compiling is most of the time of the tests, and a program without LLVM's optimisations is compiled in half of it.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+# Two devices, so that sweeps have something to spread over.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=2"
+)
 
 import jax
 import pytest

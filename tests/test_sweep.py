@@ -51,8 +51,11 @@ def trials() -> list[Recording]:
     ]
 
 
+DEVICES = jax.local_device_count()
+
+
 def chunk_of(count: int) -> float:
-    """A budget of so many elements (bytes)."""
+    """A budget of so many elements a device (bytes)."""
     return (count + 0.5) * elements.element_bytes(256, 1, Sizes(256, 64), 1)
 
 
@@ -130,12 +133,23 @@ def test_a_trial_that_cannot_be_used_costs_one_row(table, trials):
     assert table["note"].notna().sum() == 1
 
 
-def test_a_budget_of_memory_changes_no_number(table, trials):
-    steps = []
-    chunked = sweep(
-        trials, settings(), gyr_rails=RAILS, memory=chunk_of(1), progress=lambda *step: steps.append(step)
-    )
-    assert steps == [("sweep", done, 6) for done in range(1, 7)]
+def test_neither_memory_nor_devices_change_a_number(table, trials):
+    steps, places = [], []
+    original = elements._scores
+
+    def kept(*args):
+        found = original(*args)
+        places.append(found["direct"]["path_rmse"].sharding)
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(elements, "_scores", kept)
+        chunked = sweep(
+            trials, settings(), gyr_rails=RAILS, memory=chunk_of(1), progress=lambda *step: steps.append(step)
+        )
+    assert all(len(place.device_set) == DEVICES for place in places)
+    assert DEVICES == 1 or not places[0].is_fully_replicated
+    assert steps == [("sweep", done, 6) for done in range(DEVICES, 7, DEVICES)]
     # Programs of other shapes round otherwise; what no rest sees of a filled value is rounding over damping.
     np.testing.assert_allclose(chunked["fill_rmse_gyr"], table["fill_rmse_gyr"], atol=1e-8)
     chunked, expected = (t.drop(columns="fill_rmse_gyr") for t in (chunked, table))
@@ -143,7 +157,7 @@ def test_a_budget_of_memory_changes_no_number(table, trials):
 
 
 @pytest.mark.parametrize(
-    ("rails", "memory"), [pytest.param(1, 2e9, marks=pytest.mark.slow), (32, chunk_of(6))]
+    ("rails", "memory"), [pytest.param(1, 2e9, marks=pytest.mark.slow), (32, chunk_of(6 // DEVICES))]
 )
 def test_many_rails_are_one_program(trials, rails, memory):
     original, traces = elements._scores.__wrapped__, []
@@ -159,7 +173,7 @@ def test_many_rails_are_one_program(trials, rails, memory):
         patch.setattr(elements, "_scores", program)
         found = sweep(trials[:1], settings(), gyr_rails=np.linspace(RAIL, 9.0, rails).tolist(), memory=memory)
     assert len(traces) == program._cached._cache_size() == 1
-    # The last chunk of six is not full: what it repeats is no row.
+    # Chunks of six, the program of the other tests; the last one is not full: what it repeats is no row.
     assert len(found) == 2 * rails and not found.duplicated(["method", "gyr_rail"]).any()
 
 

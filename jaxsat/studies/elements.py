@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
@@ -97,14 +98,18 @@ def run_elements(
 ) -> dict[str, dict[str, np.ndarray]]:
     """The scores of some elements, by method.
 
-    values: gyroscope rail, accelerometer rail and the two bounds of each element.
+    values: gyroscope rail, accelerometer rail and the two bounds of each element. Their number is a multiple of
+    that of the local devices, among which they are spread.
     """
-    stacked = jax.tree.map(lambda *x: np.stack(x), *cases)
     rails, bounds = np.repeat(values[:, :2], 3, axis=1), np.repeat(values[:, 2:], 3, axis=1)
+    mesh = jax.make_mesh((jax.local_device_count(),), ("elements",), devices=jax.local_devices())
+    elements = jax.tree.map(lambda *x: np.stack(x), *cases), rails, bounds
+    stacked, rails, bounds = jax.device_put(elements, NamedSharding(mesh, PartitionSpec("elements")))
     found = _scores(
         stacked,
         rails,
         bounds,
+        mesh,
         sizes,
         options,
         config.saturation.sweeps,
@@ -116,12 +121,24 @@ def run_elements(
 
 @eqx.filter_jit
 def _scores(
-    cases: Case, rails, bounds, sizes: Sizes, options, sweeps: int, relinearisations, standard: bool
+    cases: Case,
+    rails,
+    bounds,
+    mesh: Mesh,
+    sizes: Sizes,
+    options,
+    sweeps: int,
+    relinearisations,
+    standard: bool,
 ) -> Scores:
     def one(case, rail, bound):
         return score(case, rail, bound, sizes, options, sweeps, relinearisations, standard)
 
-    return jax.vmap(one)(cases, rails, bounds)
+    # Devices run on their own: a search that is done in one need not wait for another's.
+    spread = PartitionSpec("elements")
+    return jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False)(
+        cases, rails, bounds
+    )
 
 
 def score(

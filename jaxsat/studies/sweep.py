@@ -2,7 +2,7 @@
 
 One element is a trial at one gyroscope rail, one accelerometer rail and one pair of bounds; all methods are run on
 it. Elements of trials of about the same length share a compiled program, and `vmap` runs over them in chunks that
-keep to a memory budget. A trial that cannot be used costs one row of the table.
+keep to a memory budget, spread over the local devices. A trial that cannot be used costs one row of the table.
 """
 
 import itertools
@@ -56,7 +56,8 @@ def sweep(
     recordings: each with a name of its own; or names and a function for each that loads it when its turn comes.
     Rests are those of the recording as given, and so is the path that is compared with. gyr_rails, acc_rails:
     limits in rad/s and m/s²; infinite leaves a sensor as it is. gyr_bounds, acc_bounds: values of δ_b (default:
-    those of the configuration). memory: what the arrays of a call may take (bytes); one element always runs.
+    those of the configuration). memory: what the arrays of a call may take (bytes), on
+    each of the local devices; one element always runs.
 
     Returns one row an element and method: `trial` (the name of the recording), `method`, the rails and bounds,
     `saturated` (values), `segments` (that saturate), `status` (that of the worst segment), `cost_before`,
@@ -211,12 +212,16 @@ def _clipped_most(prepared: Prepared, lowest: Float[np.ndarray, "6"], name: str)
 def _chunks(
     batch: _Batch, plan: _Plan
 ) -> Iterator[tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C 4"], int]]:
-    """Elements, trial after trial, in chunks of one size, and how many are real; the last element is repeated."""
+    """Elements, trial after trial, in chunks of one size, and how many are real; the last element is repeated.
+
+    A chunk holds as many elements for every local device; the memory is that of each.
+    """
     case, grid = batch.cases[0], plan.grid
     compensating = sum(method != "standard" for method in plan.methods)
     each = element_bytes(len(case.path), len(case.departure), batch.sizes, compensating)
     count = len(batch.cases) * len(grid)
-    size = int(max(1.0, min(plan.memory / each, count)))
+    devices = jax.local_device_count()
+    size = devices * int(max(1.0, min(plan.memory / each, -(-count // devices))))
     for first in range(0, count, size):
         at = np.minimum(np.arange(first, first + size), count - 1)
         yield at // len(grid), grid[at % len(grid)], min(size, count - first)
