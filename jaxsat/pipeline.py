@@ -172,17 +172,22 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         else:
             fills = compensate_sequential(searched, segments, options, report)
         clock.lap("compensation")
-        # A filled value is known to lie within its bounds, no better.
-        filled = eqx.tree_at(
-            lambda t: (t.signal, t.variance), trial, (fills.unbiased, trial.variance + fills.variance)
+        filled = eqx.tree_at(lambda t: t.signal, trial, fills.unbiased)
+        path, sure = (
+            eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
+            for extra in (fills.slack, fills.variance)
         )
-        smoothed, floor = _smooth(filled, config)
+        smoothed, floor = _smooth(path, config)
+        if (fills.slack != fills.variance).any():
+            # How sure the path is, is another question.
+            covariance = _smooth(sure, config)[0].covariance
+            smoothed = eqx.tree_at(lambda s: s.covariance, smoothed, covariance)
         clock.lap("smoother")
 
     n = len(recording)
 
     def sampled(f):
-        return f.signal, f.variance, f.sd, f.gap_sd, f.identified, f.at_bound
+        return f.signal, f.variance, f.slack, f.sd, f.gap_sd, f.identified, f.at_bound
 
     fills = eqx.tree_at(sampled, fills, [x[:n] for x in sampled(fills)])
     if floor is not None:

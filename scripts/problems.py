@@ -91,7 +91,7 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
     states, covariances = filter_trial(first, first.signal, jnp.where(sure, 0.0, first.unfilled_variance))
     state, covariance = jax.tree.map(lambda x: x[batch.departure], (states, covariances))
     return solve_segments(
-        trial, state, covariance, table, batch.departure, batch.arrival, batch.sizes, options
+        trial, state, covariance, table, batch.departure, batch.arrival, None, batch.sizes, options
     )
 
 

@@ -6,7 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsat.saturation.prior import ORDER, WIDTH, Known, SignalPrior, learn, of_values, spread
+from jaxsat.saturation.prior import (
+    CREDIT,
+    LEAST_LEVEL,
+    NODES,
+    ORDER,
+    WIDTH,
+    Known,
+    SignalPrior,
+    hidden_excess,
+    learn,
+    of_values,
+    spread,
+)
 
 N = 3000
 PERIOD = jnp.asarray(0.01)
@@ -63,6 +75,9 @@ def test_saturated_and_resting_samples_are_not_looked_at(walk):
     hidden = ~clean | ~moving[:, None]
     spoilt = np.where(hidden, 1e3 * np.random.default_rng(0).normal(size=walk.shape), walk)
     expected, found = (learned(x, sign, clean, moving) for x in (walk, spoilt))
+    np.testing.assert_allclose(found.kernel, expected.kernel, rtol=1e-9)
+    # Where the rail is, saturated values do say.
+    found = learned(np.where(sign != 0, walk, spoilt), sign, clean, moving)
     for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-9)
     seen = learned(spoilt)
@@ -90,7 +105,7 @@ OF_VALUES = jax.jit(of_values)
 @pytest.fixture(scope="module")
 def prior() -> SignalPrior:
     kernel = np.stack([kernel_of(filter_of(PHI), variance) for variance in SIGMA**2])
-    return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2))
+    return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2), jnp.ones((6, len(NODES))))
 
 
 def known(prior, signal=SHORT, sample=SAMPLE, channel=CHANNEL, sign=SIGN) -> Known:
@@ -150,3 +165,71 @@ def test_the_mode_of_a_gap_is_the_most_probable_signal(prior):
     rng = np.random.default_rng(1)
     assert all(energy(best) < energy(best + 0.1 * rng.normal(size=M) * (SIGN != 0)) for _ in range(20))
     assert eqx.tree_equal(found, known(prior))
+
+
+HIDDEN = jax.jit(hidden_excess)
+
+
+def hidden_errors(x, ok, rail, kernel, length) -> list[tuple[float, float, float]]:
+    """Squared error, variance and weight of each peak of so many samples, written out."""
+    reach, found = len(kernel) - 1, []
+    lag = np.abs(np.subtract.outer(np.arange(len(x)), np.arange(len(x))))
+    band = np.where(lag <= reach, kernel[np.minimum(lag, reach)], 0.0)
+    for way in (1.0, -1.0):
+        for i in range(reach + 1, len(x) - length - reach):
+            inside, y = np.arange(i, i + length), way * x.copy()
+            level = max(y[i - 1], y[i + length])
+            if not ok[i - reach : i + length + reach].all() or level <= LEAST_LEVEL * rail:
+                continue
+            if y[inside].min() <= level:
+                continue
+            lost, top = np.sum(y[inside] - level), y[inside].max()
+            y[inside] = level
+            own = band[np.ix_(inside, inside)] + np.eye(length) / ((WIDTH * rail) ** 2 * length)
+            filled = np.linalg.solve(own, -(band @ y)[inside]).sum()
+            found.append(((max(filled, 0.0) - lost) ** 2, np.linalg.inv(own).sum(), (top / rail) ** 4))
+    return found
+
+
+def test_hidden_peaks_are_filled_one_by_one(walk):
+    """Against each peak cut off and filled by dense algebra."""
+    x = np.random.default_rng(8).normal(size=400).cumsum() + 3.0 * np.sin(np.arange(400) / 7.0)
+    ok = np.ones(400, bool)
+    ok[120:130] = False
+    kernel, rail = kernel_of(filter_of(PHI), 0.8), 6.0
+    found = HIDDEN(*map(jnp.asarray, (x, ok)), jnp.asarray(rail), jnp.asarray(kernel))
+    seen = 0
+    for length, ratio in zip(NODES, found, strict=True):
+        peaks = np.array(hidden_errors(x, ok, rail, kernel, length)).reshape(-1, 3)
+        seen += len(peaks)
+        error = np.sum(peaks[:, 0] / peaks[:, 1] * peaks[:, 2]) + CREDIT
+        assert ratio == pytest.approx(error / (peaks[:, 2].sum() + CREDIT), rel=1e-8)
+    assert seen > 20
+
+
+def test_a_prior_that_is_right_is_believed_and_one_that_is_surprised_is_not():
+    """A rhythm that the prior learns; then with impacts of one sample that nothing announces."""
+    rng, time = np.random.default_rng(9), np.arange(N)
+    calm = np.stack([5.0 * np.sin(time / 6.0 + k) for k in range(6)], axis=1)
+    calm = calm + 1e-2 * rng.normal(size=calm.shape)
+    struck = calm.copy()
+    struck[40::37] += np.where(struck[40::37] > 0.0, 4.0, -4.0)
+    sign = np.zeros((N, 6), int)
+    sign[::1000] = 1
+    one = NODES.index(1)
+    assert (learned(calm, sign).excess[:, one] < 2.0).all()
+    assert (learned(struck, sign).excess[:, one] > 1.5).all()
+
+
+def test_what_was_far_off_is_believed_less(prior):
+    """A gap whose like was off by twice the sd has a quarter of the precision, and the same mode but for the pull."""
+    found = known(prior)
+    excess = prior.excess.at[1].set(4.0)
+    doubted = known(SignalPrior(prior.kernel, prior.innovation, excess))
+    real = SIGN != 0
+    rail = np.abs(SHORT[SAMPLE, CHANNEL])
+    pull = np.diag(np.where(real, 1.0 / ((WIDTH * rail) ** 2 * np.maximum(LENGTH, 1.0)), 1.0))
+    scale = np.where(CHANNEL == 1, 0.5, 1.0)
+    expected = (np.asarray(found.precision) - pull) * np.outer(scale, scale) + pull
+    np.testing.assert_allclose(doubted.precision, expected, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(doubted.slope, found.slope * scale**2, rtol=1e-12)

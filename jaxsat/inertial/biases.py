@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial import kalman
+from jaxsat.inertial.dense import inverse_positive
 from jaxsat.inertial.rotations import quat_exp, quat_multiply, quat_to_matrix
 from jaxsat.inertial.smoother import VELOCITY, Rows, linearised, smooth
 from jaxsat.inertial.strapdown import (
@@ -87,7 +88,7 @@ def estimate_biases(
         # In units of the prior, where the Hessian is at least the identity.
         hessian = jnp.eye(6) + quadratic[1:, 1:] * sd[:, None] * sd[None]
         gradient = bias / sd + quadratic[1:, 0] * sd
-        covariance = jnp.linalg.inv(hessian) * sd[:, None] * sd[None]
+        covariance = inverse_positive(hessian) * sd[:, None] * sd[None]
         return bias - covariance @ (gradient / sd), covariance
 
     return jax.lax.fori_loop(0, steps, step, (start, jnp.diag(sd**2)))

@@ -42,7 +42,9 @@ class Fills(eqx.Module):
 
     signal: Float[np.ndarray, "N 6"]
     variance: Float[np.ndarray, "N 6"]
-    """What a filled value adds to the sensor's noise."""
+    """What a filled value adds to the sensor's noise, before rests are heard."""
+    slack: Float[np.ndarray, "N 6"]
+    """What it adds for the path that goes with the filled signal."""
     bias: Float[np.ndarray, "6"]
     """Of the sensors (rad/s, m/s²); zero where they are not estimated."""
     sd: Float[np.ndarray, "N 6"]
@@ -71,6 +73,7 @@ class Fills(eqx.Module):
         return Fills(
             signal=np.array(trial.signal),
             variance=np.array(trial.unfilled_variance),
+            slack=np.array(trial.unfilled_variance),
             bias=np.zeros(6),
             sd=np.zeros(shape),
             gap_sd=np.full(shape, np.nan),
@@ -96,6 +99,7 @@ class Fills(eqx.Module):
             + trial.sign[sample, channel] * found.delta[real]
         )
         self.variance[sample, channel] = found.variance[real]
+        self.slack[sample, channel] = found.slack[real]
         self.sd[sample, channel] = np.sqrt(found.variance[real])
         self.at_bound[sample, channel] = found.at_bound[real]
         self.status[segments] = found.solution.status
@@ -132,11 +136,14 @@ def solve_segments(
     table: Float[Arrays, "L 10 10"],
     departure: Int[Arrays, "L"],
     arrival: Int[Arrays, "L"],
+    prior: SignalPrior | None,
     sizes: Sizes,
     options: Options,
 ) -> tuple[SegmentFill, Values]:
-    """Some segments of a recording side by side, from the filtered states at their departures."""
-    prior = signal_prior(trial) if options.method == "map" else None
+    """Some segments of a recording side by side, from the filtered states at their departures.
+
+    prior: what `signal_prior` says; None for methods other than `map`.
+    """
 
     def solve(state, covariance, table, departure, arrival):
         segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
@@ -152,11 +159,11 @@ def judge_segments(
     table: Float[Arrays, "L 10 10"],
     departure: Int[Arrays, "L"],
     arrival: Int[Arrays, "L"],
-    delta: Float[Arrays, "L m"],
+    prior: SignalPrior,
     sizes: Sizes,
+    delta: Float[Arrays, "L m"],
 ) -> tuple[Uncertainty, Values]:
     """How well what `map` found for them is known; the arguments of `solve_segments`, and its δ."""
-    prior = signal_prior(trial)
 
     def judge(state, covariance, table, departure, arrival, delta):
         segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
@@ -166,6 +173,7 @@ def judge_segments(
 
 
 def signal_prior(trial: Trial) -> SignalPrior:
+    """What the unsaturated samples of a recording say of its saturated ones."""
     moving = ~jnp.asarray(trial.rows.rest)
     signal, sign, clean = map(jnp.asarray, (trial.signal, trial.sign, trial.clean))
     return learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0])
@@ -189,6 +197,7 @@ _bias = eqx.filter_jit(trial_biases)
 _filter = eqx.filter_jit(filter_trial)
 _solve = eqx.filter_jit(solve_segments)
 _judge = eqx.filter_jit(judge_segments)
+_prior = eqx.filter_jit(signal_prior)
 
 
 @eqx.filter_jit
@@ -212,16 +221,17 @@ def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 1
 
 
 def _solve_some(
-    trial, departures, table, segments: Segments, mine, sizes: Sizes, options, fills: Fills, last: bool
+    trial, departures, table, segments: Segments, mine, prior, sizes: Sizes, options, fills: Fills, last: bool
 ) -> None:
     """Solve the segments `mine`, padded to a bucket of lanes, and record them; judge them if nothing follows."""
     lanes = bucket(len(mine), 1)
     given = (departures, table[mine], segments.departure[mine], segments.arrival[mine])
     (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x, lanes), given)
-    found, values = _solve(trial, states, covariances, table, departure, arrival, sizes, options)
+    problem = (trial, states, covariances, table, departure, arrival, prior, sizes)
+    found, values = _solve(*problem, options)
     fills.record(trial, mine, found, values)
-    if last and options.method == "map":
-        judged = _judge(trial, states, covariances, table, departure, arrival, found.delta, sizes)
+    if last and prior is not None:
+        judged = _judge(*problem, found.delta)
         fills.record_uncertainty(*judged)
 
 
@@ -231,6 +241,7 @@ def compensate_parallel(
     """Solve each segment on its own from one filter pass over the recording; then again with the filled signal."""
     fills = Fills.nothing(trial, len(segments))
     table = arrival_table(trial, segments)
+    prior = _prior(trial) if options.method == "map" else None
     chunks = list(_chunks(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
     for sweep in range(sweeps):
@@ -241,7 +252,7 @@ def compensate_parallel(
             at = np.maximum(segments.departure[mine], 0)
             departures = jax.tree.map(lambda x, at=at: x[at], filtered)
             _solve_some(
-                shifted, departures, table, segments, mine, sizes, options, fills, sweep == sweeps - 1
+                shifted, departures, table, segments, mine, prior, sizes, options, fills, sweep == sweeps - 1
             )
             done += len(mine)
             if progress:
@@ -269,6 +280,7 @@ def compensate_sequential(
     """The paper's order: each segment departs from the filtered end of the one before, filled already."""
     fills = Fills.nothing(trial, len(segments))
     table = arrival_table(trial, segments)
+    prior = _prior(trial) if options.method == "map" else None
     samples, values = count_values(trial.sign, segments)
     busy = np.flatnonzero(values)
     # One program for all of them.
@@ -279,7 +291,7 @@ def compensate_sequential(
         state, covariance = _filter_to(trial, fills, state, covariance, at, departure)
         at = departure
         here = jax.tree.map(lambda x: np.asarray(x)[None], (state, covariance))
-        _solve_some(trial, here, table, segments, np.array([index]), sizes, options, fills, True)
+        _solve_some(trial, here, table, segments, np.array([index]), prior, sizes, options, fills, True)
         if progress:
             progress(count + 1, len(busy))
     return fills

@@ -82,7 +82,9 @@ class SegmentFill(eqx.Module):
     """f(0)."""
     solution: Solution
     variance: Float[Array, "m"]
-    """What a smoother should add to the noise of each filled value."""
+    """Of each filled value before rests are heard: what makes a smoother's covariances honest."""
+    slack: Float[Array, "m"]
+    """What to add to the noise of each filled value for the path that goes with it."""
     at_bound: Bool[Array, "m"]
     """δ ends at its bound: the bound decided, not the data."""
 
@@ -156,7 +158,16 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     real = segment.bound > 0.0
     # Where no prior says better, a value lies anywhere within its bounds: uniform in 0 ≤ δ ≤ δ_b.
     variance = segment.bound**2 / 12.0 if known is None else jnp.where(real, spread(known), 0.0)
+    # δ of `map` is the mode together with the path, which takes it as measured: a smoother that is free to turn what
+    # is filled once more lets it account for what other axes did. Accelerometers saturate in impacts, which no smooth
+    # prior describes; there the path is better off with some freedom.
+    slack = variance if known is None else jnp.where(segment.channel < 3, 0.0, variance)
     at_bound = real & (delta >= segment.bound * (1.0 - 1e-9))
     return SegmentFill(
-        delta=delta, cost_before=before, solution=solution, variance=variance, at_bound=at_bound
+        delta=delta,
+        cost_before=before,
+        solution=solution,
+        variance=variance,
+        slack=slack,
+        at_bound=at_bound,
     )

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsat.inertial.dense import inverse_positive, solve_positive
+
 # Terms that predict the second difference. On the PyShoe walks of the list `clip`, filled by the prior alone, the RMS
 # error of a gap's integral with 1, 2, 4, 6 terms is 15, 15, 18, 21 mrad clipped at 350 °/s and 62, 58, 46, 52 mrad
 # at 250 °/s.
@@ -24,6 +26,12 @@ REACH = 0.1
 FEWEST = 100
 # Root mean square of what a gap lost (δ), in rails.
 WIDTH = 0.5
+# Lengths (samples) of the peaks that are hidden and filled, to see how far off the prior is; each twice the last.
+NODES = (1, 2, 4, 8, 16, 32, 64)
+# A hidden peak stands above so much of the rail at least.
+LEAST_LEVEL = 0.25
+# As if so many hidden peaks at the rail had been as far off as the prior says.
+CREDIT = 2.0
 
 
 class SignalPrior(eqx.Module):
@@ -33,6 +41,8 @@ class SignalPrior(eqx.Module):
     """c(0), c(1), … of each channel, in 1/(its unit)²."""
     innovation: Float[Array, "*six"]
     """σ², the variance of a sample given all before it."""
+    excess: Float[Array, "*six L"]
+    """By how much the squares of the errors of hidden peaks exceed what the kernel says, by length (`NODES`)."""
 
 
 def learn(
@@ -72,12 +82,56 @@ def _learn_channel(x, saturated, ok, reach) -> SignalPrior:
     total = jnp.maximum(jnp.sum(weight), 1.0)
     mean_square = jnp.maximum(moments[0, 0] / total, 1e-12)
     ridge = ORDER * mean_square * jnp.eye(ORDER)
-    phi = jnp.linalg.solve(moments[1:, 1:] + ridge, moments[1:, 0])
+    phi = solve_positive(moments[1:, 1:] + ridge, moments[1:, 0])
     innovation = jnp.maximum((moments[0, 0] - phi @ moments[1:, 0]) / total, 1e-3 * mean_square)
     predictor = jnp.convolve(jnp.array([1.0, -2.0, 1.0]), jnp.concatenate([jnp.ones(1), -phi]))
     size = len(predictor)
     kernel = jnp.stack([jnp.sum(predictor[: size - k] * predictor[k:]) for k in range(size)])
-    return SignalPrior(kernel=kernel / innovation, innovation=innovation)
+    kernel = kernel / innovation
+    excess = hidden_excess(x, ok, jnp.max(jnp.where(saturated, jnp.abs(x), 0.0)), kernel)
+    return SignalPrior(kernel=kernel, innovation=innovation, excess=excess)
+
+
+def hidden_excess(
+    x: Float[Array, "N"], ok: Bool[Array, "N"], rail: Float[Array, ""], kernel: Float[Array, "K"]
+) -> Float[Array, "L"]:
+    """Mean of the squared errors of filled peaks over the prior's variance: masked cross-validation on a channel.
+
+    Peaks that did not saturate (`ok`) are cut off at the higher of the values beside them, and what they lost in all
+    is asked of the prior; those near the rail count most.
+    """
+    reach = len(kernel) - 1
+    lag = jnp.abs(jnp.arange(NODES[-1])[:, None] - jnp.arange(NODES[-1])[None])
+    band = jnp.where(lag <= reach, kernel[jnp.minimum(lag, reach)], 0.0)
+    rail, steps, bad = jnp.where(rail > 0.0, rail, 1.0), jnp.arange(len(x)), jnp.cumsum(~ok)
+
+    def at(values, offset):
+        return jnp.roll(values, -offset)
+
+    def peaks_up(x):
+        least, top, total, found = x, x, x, []
+        for length in NODES:
+            if half := length // 2:
+                least, top = jnp.minimum(least, at(least, half)), jnp.maximum(top, at(top, half))
+                total = total + at(total, half)
+            inside = (steps > reach) & (steps < len(x) - length - reach)
+            sound = inside & (at(bad, length + reach - 1) == at(bad, -reach - 1))
+            level = jnp.maximum(at(x, -1), at(x, length))
+            peak = sound & (least > level) & (level > LEAST_LEVEL * rail)
+            pull = 1.0 / ((WIDTH * rail) ** 2 * length)
+            # The sum of what is filled is linear in the level and in the values on both sides.
+            toll = solve_positive(band[:length, :length] + pull * jnp.eye(length), jnp.ones(length))
+            weights = jnp.convolve(toll, jnp.concatenate([kernel[:0:-1], kernel]))
+            left, within, right = jnp.split(weights, [reach, reach + length])
+            sides = sum(left[k] * at(x, k - reach) + right[k] * at(x, length + k) for k in range(reach))
+            filled = jnp.maximum(-sides - jnp.sum(within) * level, 0.0)
+            square = (filled - (total - length * level)) ** 2 / jnp.sum(toll)
+            weight = jnp.where(peak, (top / rail) ** 4, 0.0)
+            found.append((jnp.sum(weight * square), jnp.sum(weight)))
+        return jnp.array(found)
+
+    squares, weights = jnp.sum(jax.vmap(peaks_up)(jnp.stack([x, -x])), axis=0).T
+    return (squares + CREDIT) / (weights + CREDIT)
 
 
 class Known(eqx.Module):
@@ -111,10 +165,16 @@ def of_values(
     # Values of a gap go together: what is known of their mean must not be counted once for each.
     pull = 1.0 / ((WIDTH * rail) ** 2 * jnp.maximum(length, 1.0))
     real = sign != 0.0
-    precision = jnp.where(same & real[:, None] & real[None], values * sign[:, None] * sign[None], 0.0)
+    # What is far off with hidden peaks of that length is believed less.
+    place = jnp.clip(jnp.log2(jnp.maximum(length, 1.0)), 0.0, len(NODES) - 1.0)
+    nearness = jnp.maximum(1.0 - jnp.abs(place[:, None] - jnp.arange(float(len(NODES)))[None]), 0.0)
+    # In a loop: else XLA computes it again for each pair of values.
+    doubt = jax.lax.map(lambda pair: pair[0] @ pair[1], (nearness, prior.excess[channel]))
+    scale = sign / jnp.sqrt(doubt)
+    precision = jnp.where(same & real[:, None] & real[None], values * scale[:, None] * scale[None], 0.0)
     precision = precision + jnp.diag(jnp.where(real, pull, 1.0))
     slope = jnp.sum(weights * window, axis=1)
-    return Known(precision, jnp.where(real, sign * slope, 0.0))
+    return Known(precision, jnp.where(real, sign * slope / doubt, 0.0))
 
 
 def spread(known: Known) -> Float[Array, "m"]:
@@ -123,4 +183,4 @@ def spread(known: Known) -> Float[Array, "m"]:
     A smoother takes values as independent, though errors within a gap go together. Letting each stand for its whole
     gap (row sums of the covariance) was worse: rests have told most of that sum already.
     """
-    return jnp.diagonal(jnp.linalg.inv(known.precision))
+    return jnp.diagonal(inverse_positive(known.precision))

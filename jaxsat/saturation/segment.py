@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.components import Cholesky, Matrix, Quaternion, Scalar, Vector
+from jaxsat.inertial.dense import eigh
 from jaxsat.inertial.preintegration import Passage, Stretch, passage, stretches
 from jaxsat.inertial.strapdown import NavState
 from jaxsat.saturation.gap_shapes import Edges
@@ -125,7 +126,7 @@ def condense(segment: Segment) -> Condensed:
         P = P[_POSITION_LAST][:, _POSITION_LAST]
     size = 9 if position else 6
     P = Matrix.of(P[:size, :size])
-    values, vectors = jnp.linalg.eigh(segment.arrival[:6, :6])
+    values, vectors = eigh(segment.arrival[:6, :6])
     one = jnp.ones_like(segment.height_variance)
     variance = pick(segment.variance)
     return Condensed(

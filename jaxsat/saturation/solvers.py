@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial.components import Cholesky, Matrix
+from jaxsat.inertial.dense import solve_positive
 
 with warnings.catch_warnings():
     # jaxopt announces on import that it is no longer developed; it is the solver the project is built on.
@@ -293,7 +294,7 @@ def dense_box_step(
         slope = gradient + hessian @ d
         held = ((d <= low) & (slope >= 0.0)) | ((d >= high) & (slope <= 0.0))
         masked = jnp.where(held[:, None] | held[None], jnp.diag(jnp.where(held, 1.0, 0.0)), hessian)
-        step = -jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(masked), True), jnp.where(held, 0.0, slope))
+        step = -solve_positive(masked, jnp.where(held, 0.0, slope))
         tried = jnp.clip(d[None] + fractions * step[None], low[None], high[None])
         value = tried @ gradient + 0.5 * jnp.sum(tried * (tried @ hessian), axis=1)
         best = tried[jnp.argmin(value)]

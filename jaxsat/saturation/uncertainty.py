@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
+from jaxsat.inertial.dense import inverse_positive, solve_positive
 from jaxsat.saturation.segment import Segment, condense, value_gradient_root
 
 # A cut-off further than so many sd into the tail: what is left there behaves as at this one.
@@ -33,11 +34,11 @@ def uncertainty(segment: Segment, delta: Float[Array, "m"], gravity: Float[Array
     assert known is not None, "the signal prior was gathered"
     _, slope, columns = value_gradient_root(delta, condense(segment), gravity)
     slope = slope + known.slope + known.precision @ delta
-    before = jnp.linalg.inv(known.precision)
+    before = inverse_positive(known.precision)
     A = jnp.stack(columns, axis=1)
     seen = before @ A
     inner = jnp.eye(A.shape[1]) + A.T @ seen
-    after = before - seen @ jnp.linalg.solve(inner, seen.T)
+    after = before - seen @ solve_positive(inner, seen.T)
 
     real = segment.bound > 0.0
     member = (segment.gap[None, :] == jnp.arange(len(delta))[:, None]) & real[None, :]

@@ -14,7 +14,13 @@ from jaxsat.config import Config
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import Prepared
-from jaxsat.saturation.compensate import arrival_table, filter_trial, solve_segments, trial_biases
+from jaxsat.saturation.compensate import (
+    arrival_table,
+    filter_trial,
+    signal_prior,
+    solve_segments,
+    trial_biases,
+)
 from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
 from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
@@ -187,30 +193,31 @@ def score(
         found["standard"] = compared(path, signal)
     at, unfilled = jnp.maximum(case.departure, 0), trial.unfilled_variance
     for option in options:
+        prior = signal_prior(trial) if option.method == "map" else None
 
-        def once(before, _, option=option):
-            filled, extra, bias = before
+        def once(before, _, option=option, prior=prior):
+            filled, extra, _, bias = before
             filtered = filter_trial(trial, filled - bias[None], extra)
             states, covariances = jax.tree.map(lambda x: x[at], filtered)
             shifted = eqx.tree_at(lambda t: t.signal, trial, signal - bias[None])
             fill, values = solve_segments(
-                shifted, states, covariances, case.table, case.departure, case.arrival, sizes, option
+                shifted, states, covariances, case.table, case.departure, case.arrival, prior, sizes, option
             )
             place = (values.sample, values.channel)
             way = sign.at[place].get(mode="fill", fill_value=0)
             filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")
-            extra = unfilled.at[place].set(fill.variance, mode="drop")
+            extra, slack = (unfilled.at[place].set(x, mode="drop") for x in (fill.variance, fill.slack))
             if option.bias_sd is not None:
                 # A recording that does not saturate is left as it is.
                 moved = trial_biases(trial, filled, extra, option.bias_sd, bias)
                 bias = jnp.where(jnp.any(sign != 0), moved, 0.0)
-            return (filled, extra, bias), (fill, values)
+            return (filled, extra, slack, bias), (fill, values)
 
         # A loop, not a repetition: the program is compiled once.
-        begin = (signal, unfilled, jnp.zeros(6, signal.dtype))
-        (filled, extra, bias), every = jax.lax.scan(once, begin, None, length=sweeps)
+        begin = (signal, unfilled, unfilled, jnp.zeros(6, signal.dtype))
+        (filled, _, slack, bias), every = jax.lax.scan(once, begin, None, length=sweeps)
         fill, values = jax.tree.map(lambda x: x[-1], every)
-        path = _smooth_path(trial, filled - bias[None], trial.variance + extra, relinearisations)
+        path = _smooth_path(trial, filled - bias[None], trial.variance + slack, relinearisations)
         busy = jnp.any(values.sample < count, axis=1)
         order = jnp.asarray([_SEVERITY.index(status) for status in sorted(Status)])
         worst = jnp.max(jnp.where(busy, order[fill.solution.status], 0))

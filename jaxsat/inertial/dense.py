@@ -1,0 +1,42 @@
+"""Linear algebra of dense matrices that may run side by side on a CPU.
+
+The LAPACK kernels of jaxlib split a batch over the threads that they run on themselves, and wait: as many such calls
+at a time as there are cores wait for each other for ever (seen with jaxlib 0.10.2 on two cores: an inverse beside a
+search that factorises). So on a CPU each matrix of a batch is a call of its own, which waits for nothing.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def _one_by_one(function: Callable) -> Callable:
+    single = jax.custom_batching.sequential_vmap(function)
+
+    def call(*matrices):
+        return jax.lax.platform_dependent(*matrices, cpu=single, default=function)
+
+    return call
+
+
+_solve_positive = _one_by_one(
+    lambda matrix, right: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right)
+)
+_eigh = _one_by_one(lambda matrix: tuple(jnp.linalg.eigh(matrix)))
+
+
+def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """x of matrix @ x = right with a positive definite matrix."""
+    return _solve_positive(matrix, right)
+
+
+def inverse_positive(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of a positive definite matrix."""
+    return _solve_positive(matrix, jnp.eye(len(matrix), dtype=matrix.dtype))
+
+
+def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+    """Eigenvalues, rising, and eigenvectors (columns) of a symmetric matrix."""
+    return _eigh(matrix)
