@@ -1,0 +1,56 @@
+"""Saturated samples filled from the signal alone, for the standard smoother; neither knows of rests.
+
+- `spline`: the cubic spline through a channel's unsaturated samples (SciPy's, not-a-knot).
+- `second_difference`: the values of least sum of squared second differences, the rest of the channel as measured.
+
+What lies below its rail is put there; a gap at an end of the recording stays as measured.
+"""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import spsolve
+
+from jaxsat.config import load_config
+from jaxsat.pipeline import Prepared, estimate
+from jaxsat.signals.recording import Recording
+
+Channel = Float[np.ndarray, "N"]
+
+
+def spline(channel: Channel, lost: Bool[np.ndarray, "N"]) -> Channel:
+    at = np.arange(len(channel))
+    return CubicSpline(at[~lost], channel[~lost])(at)
+
+
+def second_difference(channel: Channel, lost: Bool[np.ndarray, "N"]) -> Channel:
+    n = len(channel)
+    second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n)).tocsc()
+    filled = np.where(lost, 0.0, channel)
+    free = second[:, lost]
+    filled[lost] = spsolve((free.T @ free).tocsc(), -free.T @ (second @ filled))
+    return filled
+
+
+FILLS = {"spline": spline, "second_difference": second_difference}
+
+
+def filled(recording: Recording, prepared: Prepared, name: str) -> Recording:
+    """A recording with the samples that `prepared` calls saturated filled, and its rests."""
+    signal, sign = recording.signal.copy(), prepared.sign
+    inside = (sign == 0).cumsum(axis=0).astype(bool) & (sign == 0)[::-1].cumsum(axis=0)[::-1].astype(bool)
+    for j in np.flatnonzero((sign != 0).any(axis=0)):
+        way, measured = sign[:, j], recording.signal[:, j]
+        guess = FILLS[name](measured, (way != 0) & inside[:, j])
+        signal[:, j] = np.where(way != 0, way * np.maximum(way * guess, way * measured), measured)
+    return eqx.tree_at(
+        lambda r: r.rest, recording.with_signal(signal), prepared.rest, is_leaf=lambda x: x is None
+    )
+
+
+def filled_standard(recording: Recording, prepared: Prepared, name: str) -> Float[np.ndarray, "N 3"]:
+    """Positions (m) by the standard smoother on the filled recording."""
+    config = load_config(None, method="standard", **{"rails.gyr": "none", "rails.acc": "none"})
+    return estimate(filled(recording, prepared, name), config).trajectory.position
