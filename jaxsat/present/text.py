@@ -8,9 +8,11 @@ import numpy as np
 import pandas as pd
 
 from jaxsat.attitude import Orientation
+from jaxsat.config import Noise
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
+from jaxsat.studies.tuning import TunedNoise
 
 
 def columns(rows: Sequence[Sequence[str]]) -> str:
@@ -155,3 +157,17 @@ def sweep_text(table: pd.DataFrame, path: Path) -> str:
     ]
     lines += [f"failed: {note}" for note in failed["note"]]
     return "\n".join([*lines, f"table: {path}"])
+
+
+def tuning_text(initial: Noise, tuned: TunedNoise, against_truth: bool, names: Sequence[str]) -> str:
+    """What `jaxsat tune` prints, and writes above what it found: noise and loss before and after."""
+    units = {"gyr_density": "rad/s/√Hz", "acc_density": "m/s²/√Hz", "rest_velocity_sd": "m/s"}
+    rows = [["", "before", "after", ""]]
+    for name, unit in units.items():
+        rows.append([name, *(f"{getattr(noise, name):.4g}" for noise in (initial, tuned.noise)), unit])
+    if against_truth:
+        losses = [f"{np.sqrt(loss):.4g}" for loss in (tuned.before, tuned.after)]
+        rows.append(["position RMSE", *losses, "m"])
+    else:
+        rows.append(["misfit of a rest", f"{tuned.before:.4f}", f"{tuned.after:.4f}", "-log p"])
+    return f"tuned on {plural(len(names), 'recording')}: {', '.join(names)}\n" + columns(rows)

@@ -13,8 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import spsolve
 
-from jaxsat.config import load_config
-from jaxsat.pipeline import Prepared, estimate
+from jaxsat.pipeline import Prepared
 from jaxsat.signals.recording import Recording
 
 Channel = Float[np.ndarray, "N"]
@@ -38,19 +37,14 @@ FILLS = {"spline": spline, "second_difference": second_difference}
 
 
 def filled(recording: Recording, prepared: Prepared, name: str) -> Recording:
-    """A recording with the samples that `prepared` calls saturated filled, and its rests."""
+    """A recording with the samples that `prepared` calls saturated filled, and with its rests."""
     signal, sign = recording.signal.copy(), prepared.sign
     inside = (sign == 0).cumsum(axis=0).astype(bool) & (sign == 0)[::-1].cumsum(axis=0)[::-1].astype(bool)
     for j in np.flatnonzero((sign != 0).any(axis=0)):
         way, measured = sign[:, j], recording.signal[:, j]
         guess = FILLS[name](measured, (way != 0) & inside[:, j])
         signal[:, j] = np.where(way != 0, way * np.maximum(way * guess, way * measured), measured)
+    found = recording.with_signal(signal)
     return eqx.tree_at(
-        lambda r: r.rest, recording.with_signal(signal), prepared.rest, is_leaf=lambda x: x is None
+        lambda r: (r.rest, r.clipped), found, (prepared.rest, None), is_leaf=lambda x: x is None
     )
-
-
-def filled_standard(recording: Recording, prepared: Prepared, name: str) -> Float[np.ndarray, "N 3"]:
-    """Positions (m) by the standard smoother on the filled recording."""
-    config = load_config(None, method="standard", **{"rails.gyr": "none", "rails.acc": "none"})
-    return estimate(filled(recording, prepared, name), config).trajectory.position
