@@ -5,8 +5,9 @@
 Parts: `pyshoe` (really saturated, against Vicon, rests as given), `clipped` (PyShoe walks that do not saturate,
 clipped at 350, 250 and 200 °/s), `gaitmap` (a walk against motion capture), `openshoe` and `xio` (against their own
 unclipped path). But for PyShoe, rests are found in the clipped recording itself; nothing is told of its rails.
-Peers (`peers/fills.py`) see the same saturated samples and rests. Writes board.json, env.json, trials.csv and
-figures; what was not run again keeps its rows.
+Peers: fills (`peers/fills.py`) see the same saturated samples and rests; gaitmap's RtsKalman, on the recording as
+measured and filled by the spline, takes part in `gaitmap` where it is installed. Writes board.json, env.json,
+trials.csv and figures; what was not run again keeps its rows.
 """
 
 import argparse
@@ -20,7 +21,9 @@ import numpy as np
 import pandas as pd
 from accuracy_figures import draw_ratios, draw_trial
 from jaxtyping import Float
+from peers import MissingPeer, import_peer
 from peers.fills import FILLS, filled
+from peers.gaitmap_rts import rts_kalman
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
@@ -37,7 +40,9 @@ from jaxsat.studies.metrics import (
 )
 
 METHODS = ("standard", "direct", "map")
-EVERY = (*METHODS, *FILLS)
+RTS = {"rts": None, "rts_spline": "spline"}
+"""gaitmap's RtsKalman, and what fills its recording."""
+EVERY = (*METHODS, *FILLS, *RTS)
 # What was filled is not looked at again.
 IGNORANT = {"method": "standard", "rails.gyr": "none", "rails.acc": "none"}
 KEY = ["part", "trial", "kind", "method"]
@@ -63,12 +68,16 @@ class Found(NamedTuple):
 
 
 def run(recording: Recording, method: str) -> Found:
-    if method in FILLS:
+    if method not in METHODS:
         prepared = prepare(recording, load_config(None))
         lost, gaps = int((prepared.sign != 0).sum()), len(prepared.gaps)
-        mended = filled(recording, prepared, method)
-        position = estimate(mended, load_config(None, **IGNORANT)).trajectory.position
-        same = bool((mended.signal == recording.signal).all())
+        fill = RTS.get(method, method)
+        mended = recording if fill is None else filled(recording, prepared, fill)
+        if method in RTS:
+            position, same = rts_kalman(mended, prepared), False
+        else:
+            position = estimate(mended, load_config(None, **IGNORANT)).trajectory.position
+            same = bool((mended.signal == recording.signal).all())
         return Found(method, recording.time, position, lost, gaps, same_as_standard=same)
     found = estimate(recording, load_config(None, method=method))
     return Found(
@@ -269,21 +278,35 @@ def draw(folder: Path, table: pd.DataFrame, paths: dict[tuple[str, str, str], tu
         draw_trial(folder / name, time, truth, tracks, title)
 
 
+def installed() -> list[str]:
+    """Every method, but for those of a package that is not there."""
+    try:
+        import_peer("gaitmap")
+    except MissingPeer as missing:
+        print(missing, "Its rows stay as they are.", file=sys.stderr)
+        return [method for method in EVERY if method not in RTS]
+    return list(EVERY)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="The accuracy board")
     parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("results/accuracy"))
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--methods", nargs="+", choices=EVERY, default=list(EVERY))
+    parser.add_argument("--methods", nargs="+", choices=EVERY, help="default: every one that is installed")
     parser.add_argument("--gate", action="store_true", help="exit with 1 where something got worse")
     arguments = parser.parse_args()
     path, trials = arguments.output / "board.json", arguments.output / "trials.csv"
     former = read_board(path) if path.exists() else []
-    found = [row for part in arguments.only for row in PARTS[part](arguments.data, tuple(arguments.methods))]
+    methods = arguments.methods or installed()
+    found = []
+    for part in arguments.only:
+        here = tuple(m for m in methods if part == "gaitmap" or m not in RTS)
+        found += PARTS[part](arguments.data, here)
     paths = {tuple(row[c] for c in KEY[1:]): row.pop("path") for row in found}
     table = pd.DataFrame(found).round(6)
     if trials.exists():
-        table = merged(pd.read_csv(trials), table, arguments.only, arguments.methods)
+        table = merged(pd.read_csv(trials), table, arguments.only, methods)
     rows = {r.metric: r for r in former} | {r.metric: r for r in board(table, arguments.only)}
     sentences = worse(rows.values(), former, GATE_TOLERANCE) if arguments.gate else []
     for sentence in sentences:
@@ -300,5 +323,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except InputError as error:
+    except (InputError, MissingPeer) as error:
         sys.exit(str(error))
