@@ -264,6 +264,8 @@ def draw(folder: Path, table: pd.DataFrame, paths: dict[tuple[str, str, str], tu
     """The ratios of the saturated PyShoe trials, and the best, median and worst of `map` if they were run."""
     saturated = table[(table["part"] == "pyshoe") & (table["kind"] == "saturated")]
     errors = saturated.pivot(index="trial", columns="method", values="rmse_3d")
+    if "map" not in errors:
+        return
     ratios = errors.div(errors["standard"], axis=0).sort_values("map")
     ratios = ratios[[method for method in EVERY[1:] if method in ratios]]
     draw_ratios(folder / "ratios", ratios)
@@ -307,6 +309,9 @@ def main() -> int:
     table = pd.DataFrame(found).round(6)
     if trials.exists():
         table = merged(pd.read_csv(trials), table, arguments.only, methods)
+    for part in arguments.only:
+        if "standard" not in set(table.loc[table["part"] == part, "method"]):
+            raise InputError(f"{part}: there is no row of standard to compare with; add it to --methods.")
     rows = {r.metric: r for r in former} | {r.metric: r for r in board(table, arguments.only)}
     sentences = worse(rows.values(), former, GATE_TOLERANCE) if arguments.gate else []
     for sentence in sentences:

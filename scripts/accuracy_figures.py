@@ -45,13 +45,16 @@ def draw_ratios(path: Path, ratios: pd.DataFrame) -> None:
         places = np.arange(len(ratios)) + shift
         style = {"color": STYLES[method]["color"], "marker": MARKERS[method], "ls": "none", "ms": 6}
         mean = np.exp(np.log(ratios[method]).mean())
-        panel.plot(ratios[method], places, label=f"{LABELS[method]} (mean {mean:.2f})", **style)
+        panel.plot(ratios[method], places, label=f"{LABELS[method]} ({mean:.2f})", **style)
     panel.axvline(1.0, color=STYLES["standard"]["color"], lw=1.2, ls=STYLES["standard"]["ls"])
     panel.set_yticks(range(len(ratios)), [str(trial) for trial in ratios.index], fontsize=8)
-    panel.set(xscale="log", xlabel="position RMSE over that of the standard smoother; geometric means")
+    low, high = ratios.to_numpy().min(), ratios.to_numpy().max()
+    label = "position RMSE over that of the standard smoother (geometric means in brackets)"
+    panel.set(xscale="log", xlabel=label)
     panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     panel.xaxis.set_minor_formatter(NullFormatter())
-    panel.set_xticks([0.4, 0.5, 0.6, 0.7, 0.8, 1.0, 1.25, 1.6, 2.0])
+    panel.set_xticks([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.4, 1.6, 2.0, 3.0])
+    panel.set_xlim(0.95 * min(low, 1.0), 1.05 * max(high, 1.0))
     panel.invert_yaxis()
     figure.legend(loc="outside lower center", ncols=len(ratios.columns), fontsize=8)
     save(figure, path)

@@ -3,8 +3,8 @@
     python scripts/tune_noise.py ../shared/data [-o results/tuning]
 
 Learned from the PyShoe walks of the split `clip`, which do not saturate, rests as given: by the likelihood of their
-rests, and by their position error against Vicon. Scored is the standard smoother on these, on the split `other`, which
-hardly saturates, and on `saturated`. Writes likelihood.toml, truth.toml, board.json, board.md and env.json.
+rests, and by their position error against Vicon. Scored is the standard smoother on these, on the split `other`,
+which hardly saturates, and on `saturated`. Writes likelihood.toml, truth.toml, board.json, board.md and env.json.
 """
 
 import argparse
