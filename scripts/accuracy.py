@@ -251,13 +251,15 @@ PARTS = {
 def merged(before: pd.DataFrame, table: pd.DataFrame, parts: list[str], methods: list[str]) -> pd.DataFrame:
     """Former rows but those that were run again, or are of methods that are no longer run; then the new ones."""
     again = before["method"].isin(methods) | ~before["method"].isin(EVERY)
-    table = pd.concat([before[~(before["part"].isin(parts) & again)], table])
-    # Each part's methods stay together, each trial's kinds in their order.
-    place = {method: k for k, method in enumerate(EVERY)}
-    order = {key: k for k, key in enumerate(dict.fromkeys(zip(*(table[c] for c in KEY[:3]), strict=True)))}
-    first = [order[key] for key in zip(*(table[c] for c in KEY[:3]), strict=True)]
-    second = table["method"].map(place).fillna(len(EVERY))
-    return table.assign(first=first, second=second).sort_values(["first", "second"]).iloc[:, :-2]
+    rows = before.loc[~(before["part"].isin(parts) & again)].to_dict("records") + table.to_dict("records")
+    # A trial's methods stand together.
+    trials = list(dict.fromkeys(tuple(row[c] for c in KEY[:3]) for row in rows))
+    places = {method: k for k, method in enumerate(EVERY)}
+
+    def place(row: dict) -> tuple[int, int]:
+        return trials.index(tuple(row[c] for c in KEY[:3])), places.get(row["method"], len(EVERY))
+
+    return pd.DataFrame(sorted(rows, key=place))
 
 
 def draw(folder: Path, table: pd.DataFrame, paths: dict[tuple[str, str, str], tuple]) -> None:
@@ -266,18 +268,21 @@ def draw(folder: Path, table: pd.DataFrame, paths: dict[tuple[str, str, str], tu
     errors = saturated.pivot(index="trial", columns="method", values="rmse_3d")
     if "map" not in errors:
         return
-    ratios = errors.div(errors["standard"], axis=0).sort_values("map")
-    ratios = ratios[[method for method in EVERY[1:] if method in ratios]]
+    shown = [method for method in EVERY[1:] if method in errors]
+    ratios = pd.DataFrame({method: errors[method] / errors["standard"] for method in shown}).sort_values(
+        "map"
+    )
     draw_ratios(folder / "ratios", ratios)
-    for name, trial in (("best", 0), ("median", len(ratios) // 2), ("worst", -1)):
-        trial = str(ratios.index[trial])
-        drawn = {m: paths.get((trial, "saturated", m)) for m in ("standard", "map")}
-        if None in drawn.values():
-            continue
-        time, _, truth = drawn["map"]
-        tracks = {method: position for method, (_, position, _) in drawn.items()}
-        title = f"PyShoe {trial}: {ratios.loc[trial, 'map']:.2f} of the error of standard"
-        draw_trial(folder / name, time, truth, tracks, title)
+    for name, place in (("best", 0), ("median", len(ratios) // 2), ("worst", -1)):
+        trial = str(ratios.index[place])
+        drawn = {
+            m: paths[trial, "saturated", m] for m in ("standard", "map") if (trial, "saturated", m) in paths
+        }
+        if len(drawn) == 2:
+            time, _, truth = drawn["map"]
+            tracks = {method: position for method, (_, position, _) in drawn.items()}
+            title = f"PyShoe {trial}: {ratios.loc[trial, 'map']:.2f} of the error of standard"
+            draw_trial(folder / name, time, truth, tracks, title)
 
 
 def installed() -> list[str]:

@@ -25,8 +25,9 @@ def draw_trial(
     shown = {"truth": truth} | {name: align_yaw_translation(x, truth) for name, x in tracks.items()}
     step = max(1, len(time) // POINTS)
     for name, track in shown.items():
-        line(above, *track[::step, :2].T, name)
-        line(height, time[::step], track[::step, 2], name)
+        x, y, z = track[::step].T
+        line(above, x, y, name)
+        line(height, time[::step], z, name)
     above.set(xlabel="x (m)", ylabel="y (m)")
     above.set_aspect("equal", adjustable="datalim")
     height.set(xlabel="time (s)", ylabel="height (m)")

@@ -233,8 +233,8 @@ def tune_noise(
         gradient = eqx.filter_jit(value_and_gradient(lambda logs, trial: loss(trial, jnp.exp(logs))))
 
         def together(logs: Logs) -> tuple[Array, Array]:
-            parts = [gradient(logs, trial) for trial in trials]
-            return sum(v for v, _ in parts) / count, sum(g for _, g in parts) / count
+            values, slopes = zip(*(gradient(logs, trial) for trial in trials), strict=True)
+            return jnp.sum(jnp.stack(values)) / count, jnp.sum(jnp.stack(slopes), axis=0) / count
 
         first = jnp.log(jnp.asarray([initial.gyr_density, initial.acc_density, initial.rest_velocity_sd]))
         values: list[float] = []

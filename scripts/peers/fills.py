@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
-from scipy.sparse import diags_array
+from scipy.sparse import eye_array
 from scipy.sparse.linalg import spsolve
 
 from jaxsat.pipeline import Prepared
@@ -25,8 +25,8 @@ def spline(channel: Channel, lost: Bool[np.ndarray, "N"]) -> Channel:
 
 
 def second_difference(channel: Channel, lost: Bool[np.ndarray, "N"]) -> Channel:
-    n = len(channel)
-    second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n)).tocsc()
+    one = eye_array(len(channel), format="csr")
+    second = (one[:-2] - 2.0 * one[1:-1] + one[2:]).tocsc()
     filled = np.where(lost, 0.0, channel)
     free = second[:, lost]
     filled[lost] = spsolve((free.T @ free).tocsc(), -free.T @ (second @ filled))
