@@ -26,8 +26,10 @@ def draw_trial(
     step = max(1, len(time) // POINTS)
     for name, track in shown.items():
         x, y, z = track[::step].T
-        line(above, x, y, name)
-        line(height, time[::step], z, name)
+        # A walk crosses itself many times.
+        thin = 0.65 * STYLES[name]["lw"]
+        line(above, x, y, name, lw=thin)
+        line(height, time[::step], z, name, lw=thin)
     above.set(xlabel="x (m)", ylabel="y (m)")
     above.set_aspect("equal", adjustable="datalim")
     height.set(xlabel="time (s)", ylabel="height (m)")

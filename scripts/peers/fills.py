@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
-from scipy.sparse import eye_array
+from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from jaxsat.pipeline import Prepared
@@ -25,7 +25,7 @@ def spline(channel: Channel, lost: Bool[np.ndarray, "N"]) -> Channel:
 
 
 def second_difference(channel: Channel, lost: Bool[np.ndarray, "N"]) -> Channel:
-    one = eye_array(len(channel), format="csr")
+    one = csr_array(eye_array(len(channel)))
     second = (one[:-2] - 2.0 * one[1:-1] + one[2:]).tocsc()
     filled = np.where(lost, 0.0, channel)
     free = second[:, lost]
