@@ -11,7 +11,6 @@ import argparse
 import tomllib
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from jaxsat.cli.shared import use_compilation_cache
@@ -48,11 +47,11 @@ def main() -> None:
     splits = tomllib.loads((folder / "splits.toml").read_text())
     paths = [folder / f"{name}.mat" for name in splits[TRAIN]]
     arguments.output.mkdir(parents=True, exist_ok=True)
-    with jax.enable_x64(True):
-        trials = [
-            noise_trial(read(path, rest_column="zv_shoe_opt"), STANDARD, load_pyshoe_truth(path))
-            for path in paths
-        ]
+    recordings = [read(path, rest_column="zv_shoe_opt") for path in paths]
+    trials = [
+        noise_trial(recording, STANDARD, load_pyshoe_truth(path))
+        for recording, path in zip(recordings, paths, strict=True)
+    ]
     noises = {"default": STANDARD.noise}
     for name in ("likelihood", "truth"):
         tuned = tune_noise(
@@ -61,7 +60,8 @@ def main() -> None:
             against_truth=name == "truth",
             report=lambda done, total, name=name: print(name, done, total, flush=True),
         )
-        text = tuning_text(STANDARD.noise, tuned, name == "truth", [path.stem for path in paths])
+        noise, loss = (STANDARD.noise, tuned.noise), (tuned.before, tuned.after)
+        text = tuning_text(noise, loss, name == "truth", [path.stem for path in paths])
         print(text, flush=True)
         head = "".join(f"# {line}\n" for line in text.splitlines())
         toml = config_toml(STANDARD.model_copy(update={"noise": tuned.noise}))
@@ -80,8 +80,11 @@ def main() -> None:
                 metric = f"{split}_{axes}_{name}"
                 rows.append(Row(metric, float(mean), "m", "lower", None, baseline, what))
                 print(metric, f"{mean:.4f}", flush=True)
-    noise = {name: one.model_dump() for name, one in noises.items()}
-    write_board(arguments.output / "board.json", rows, {"noise": noise, "train": splits[TRAIN]})
+    configuration = {
+        "noise": {name: one.model_dump() for name, one in noises.items()},
+        "train": splits[TRAIN],
+    }
+    write_board(arguments.output / "board.json", rows, configuration)
 
 
 if __name__ == "__main__":

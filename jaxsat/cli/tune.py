@@ -69,20 +69,18 @@ def tune_command(
         read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc) for path in paths
     ]
     use_compilation_cache()
-    import jax
-
     from jaxsat.studies.metrics import load_truth
     from jaxsat.studies.tuning import noise_trial, tune_noise
 
-    with jax.enable_x64(True):
-        trials = [
-            noise_trial(one, settings, load_truth(path) if truth else None)
-            for one, path in zip(measured, paths, strict=True)
-        ]
+    trials = [
+        noise_trial(one, settings, load_truth(path) if truth else None)
+        for one, path in zip(measured, paths, strict=True)
+    ]
     with progress_bar(quiet) as progress:
         report = (lambda done, total: progress("steps", done, total)) if progress else (lambda *_: None)
         tuned = tune_noise(trials, settings.noise, against_truth=truth, steps=steps, report=report)
-    text = tuning_text(settings.noise, tuned, truth, [path.name for path in paths])
+    noise, loss = (settings.noise, tuned.noise), (tuned.before, tuned.after)
+    text = tuning_text(noise, loss, truth, [path.name for path in paths])
     found = settings.model_copy(update={"noise": tuned.noise})
     head = "".join(f"# {line}\n" for line in text.splitlines())
     _write(out, f"{head}\n{config_toml(found)}")

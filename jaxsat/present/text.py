@@ -12,7 +12,6 @@ from jaxsat.config import Noise
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
-from jaxsat.studies.tuning import TunedNoise
 
 
 def columns(rows: Sequence[Sequence[str]]) -> str:
@@ -159,15 +158,16 @@ def sweep_text(table: pd.DataFrame, path: Path) -> str:
     return "\n".join([*lines, f"table: {path}"])
 
 
-def tuning_text(initial: Noise, tuned: TunedNoise, against_truth: bool, names: Sequence[str]) -> str:
+def tuning_text(
+    noise: tuple[Noise, Noise], loss: tuple[float, float], against_truth: bool, names: Sequence[str]
+) -> str:
     """What `jaxsat tune` prints, and writes above what it found: noise and loss before and after."""
     units = {"gyr_density": "rad/s/√Hz", "acc_density": "m/s²/√Hz", "rest_velocity_sd": "m/s"}
     rows = [["", "before", "after", ""]]
     for name, unit in units.items():
-        rows.append([name, *(f"{getattr(noise, name):.4g}" for noise in (initial, tuned.noise)), unit])
+        rows.append([name, *(f"{getattr(one, name):.4g}" for one in noise), unit])
     if against_truth:
-        losses = [f"{np.sqrt(loss):.4g}" for loss in (tuned.before, tuned.after)]
-        rows.append(["position RMSE", *losses, "m"])
+        rows.append(["position RMSE", *(f"{np.sqrt(one):.4g}" for one in loss), "m"])
     else:
-        rows.append(["misfit of a rest", f"{tuned.before:.4f}", f"{tuned.after:.4f}", "-log p"])
+        rows.append(["misfit of a rest", *(f"{one:.4f}" for one in loss), "-log p"])
     return f"tuned on {plural(len(names), 'recording')}: {', '.join(names)}\n" + columns(rows)

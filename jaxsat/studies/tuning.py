@@ -136,7 +136,8 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
 
     truth: times (s) and positions (m); samples that they do not cover are not scored.
     """
-    prepared = prepare(recording, config)
+    with jax.enable_x64(True):
+        prepared = prepare(recording, config)
     n, size = len(recording), len(prepared.trial.signal)
     density = np.repeat([config.noise.gyr_density, config.noise.acc_density], 3)
     plain = np.isclose(prepared.trial.variance[:n], density**2 / recording.period, rtol=1e-9, atol=0.0)
@@ -178,8 +179,8 @@ def rest_misfit(trial: NoiseTrial, noise: Float[Array, "3"]) -> Float[Array, ""]
         total = total + cost - 0.5 * jnp.sum(jnp.where(seen, jnp.log(jnp.where(seen, weight, 1.0)), 0.0))
         state = add_error(state, error)
         transition = error_transition(state.q_nb, interval)
-        noise = sample_noise(state.q_nb, sample.signal, sample.period, sample.variance)
-        _, covariance = kalman.predict(error, covariance, transition, error, noise)
+        spread = sample_noise(state.q_nb, sample.signal, sample.period, sample.variance)
+        _, covariance = kalman.predict(error, covariance, transition, error, spread)
         return (advance(state, interval, gravity), covariance, total), None
 
     intervals = sample_intervals(samples.signal, samples.period)
