@@ -217,7 +217,7 @@ def tune_noise(
     *,
     against_truth: bool = False,
     steps: int = 40,
-    rate: float = 0.1,
+    rate: float = 0.2,
     report: Callable[[int, int], None] = lambda *_: None,
 ) -> TunedNoise:
     """The noise under which the rests of some recordings are likeliest, or their positions least in error.
