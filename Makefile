@@ -31,6 +31,7 @@ bench: $(STAMP)
 # The accuracy board: every method on the real recordings in DATA; half an hour.
 DATA := ../shared/data
 board: $(STAMP)
+	$(VENV)/bin/python -m pip install --quiet --editable ".[bench]"
 	$(VENV)/bin/python scripts/accuracy.py $(DATA)
 
 # The tables and figures of the paper; minutes once compiled programs are in the cache.

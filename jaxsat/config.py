@@ -1,6 +1,7 @@
 """Validated configuration: one tree of plain values, read from TOML, in SI units."""
 
 import difflib
+import json
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -191,6 +192,20 @@ def load_config(path: Path | None = None, **overrides: Any) -> Config:
         return Config.model_validate(tree)
     except ValidationError as error:
         raise InputError(f"{where}: {_sentence(error)}") from None
+
+
+def config_toml(config: Config) -> str:
+    """A configuration as TOML that `load_config` reads: its noise, and whatever else is not the default."""
+    tree = config.model_dump(exclude_defaults=True) | {"noise": config.noise.model_dump()}
+    plain = {key: value for key, value in tree.items() if not isinstance(value, dict)}
+    sections = {key: value for key, value in tree.items() if isinstance(value, dict)}
+    blocks = [("", plain), *((f"[{name}]\n", section) for name, section in sections.items())]
+    # JSON writes these values (texts, numbers, truths, pairs) as TOML does.
+    return "\n".join(
+        head + "".join(f"{key} = {json.dumps(value)}\n" for key, value in block.items())
+        for head, block in blocks
+        if block
+    )
 
 
 def _known_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:

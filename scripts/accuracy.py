@@ -1,11 +1,13 @@
 """The accuracy board: every method on real recordings, saturated by themselves or clipped in software.
 
-    python scripts/accuracy.py ../shared/data [-o results/accuracy] [--only PART ...] [--gate]
+    python scripts/accuracy.py ../shared/data [-o results/accuracy] [--only PART ...] [--methods NAME ...] [--gate]
 
 Parts: `pyshoe` (really saturated, against Vicon, rests as given), `clipped` (PyShoe walks that do not saturate,
 clipped at 350, 250 and 200 °/s), `gaitmap` (a walk against motion capture), `openshoe` and `xio` (against their own
 unclipped path). But for PyShoe, rests are found in the clipped recording itself; nothing is told of its rails.
-Writes board.json, env.json, trials.csv and README.md.
+Peers: fills (`peers/fills.py`) see the same saturated samples and rests; gaitmap's RtsKalman, on the recording as
+measured and filled by the spline, takes part in `gaitmap` where it is installed. Writes board.json, env.json,
+trials.csv and figures; what was not run again keeps its rows.
 """
 
 import argparse
@@ -13,13 +15,19 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from accuracy_figures import draw_ratios, draw_trial
+from jaxtyping import Float
+from peers import MissingPeer, import_peer
+from peers.fills import FILLS, filled
+from peers.gaitmap_rts import rts_kalman
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
-from jaxsat.pipeline import Estimate, estimate
+from jaxsat.pipeline import estimate, prepare
 from jaxsat.signals.readers import read
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.boards import Row, read_board, worse, write_board
@@ -32,6 +40,12 @@ from jaxsat.studies.metrics import (
 )
 
 METHODS = ("standard", "direct", "map")
+RTS = {"rts": None, "rts_spline": "spline"}
+"""gaitmap's RtsKalman, and what fills its recording."""
+EVERY = (*METHODS, *FILLS, *RTS)
+# What was filled is not looked at again.
+IGNORANT = {"method": "standard", "rails.gyr": "none", "rails.acc": "none"}
+KEY = ["part", "trial", "kind", "method"]
 GATE_TOLERANCE = 0.02
 
 
@@ -41,42 +55,78 @@ def clip(recording: Recording, gyr: float = np.inf, acc: float = np.inf) -> Reco
     return recording.with_signal(np.clip(recording.signal, -limit, limit))
 
 
-def runs(recording: Recording, methods: tuple[str, ...] = METHODS) -> Iterator[tuple[str, Estimate]]:
+class Found(NamedTuple):
+    """What a row of the table says of an estimate, ours or a peer's."""
+
+    method: str
+    time: Float[np.ndarray, "N"]
+    position: Float[np.ndarray, "N 3"]
+    saturated: int
+    gaps: int
+    not_converged: int = 0
+    same_as_standard: bool = True
+
+
+def run(recording: Recording, method: str) -> Found:
+    if method not in METHODS:
+        prepared = prepare(recording, load_config(None))
+        lost, gaps = int((prepared.sign != 0).sum()), len(prepared.gaps)
+        fill = RTS.get(method, method)
+        mended = recording if fill is None else filled(recording, prepared, fill)
+        if method in RTS:
+            position, same = rts_kalman(mended, prepared), False
+        else:
+            position = estimate(mended, load_config(None, **IGNORANT)).trajectory.position
+            same = bool((mended.signal == recording.signal).all())
+        return Found(method, recording.time, position, lost, gaps, same_as_standard=same)
+    found = estimate(recording, load_config(None, method=method))
+    return Found(
+        method,
+        recording.time,
+        found.trajectory.position,
+        int(found.saturated.sum()),
+        len(found.gaps),
+        int((found.fills.status == 1).sum()),
+        bool((found.trajectory.position == found.standard_position).all()),
+    )
+
+
+def runs(recording: Recording, methods: tuple[str, ...]) -> Iterator[Found]:
     for method in methods:
-        yield method, estimate(recording, load_config(None, method=method))
+        yield run(recording, method)
 
 
-def pyshoe(data: Path) -> list[dict]:
+def pyshoe(data: Path, methods: tuple[str, ...]) -> list[dict]:
     folder, rows = data / "pyshoe", []
     splits = tomllib.loads((folder / "splits.toml").read_text())
     for name in sorted(path.stem for path in folder.glob("*.mat")):
         recording = read(folder / f"{name}.mat", rest_column="zv_shoe_opt")
         _, truth = load_pyshoe_truth(folder / f"{name}.mat", at=recording.time)
         kind = "saturated" if name in splits["saturated"] else "other"
-        for method, found in runs(recording):
-            rows.append(row("pyshoe", name, kind, method, found, found.trajectory.position, truth))
+        # Without saturation a fill is the standard smoother.
+        here = methods if kind == "saturated" else tuple(m for m in methods if m in METHODS)
+        rows += [row("pyshoe", name, kind, found, truth) for found in runs(recording, here)]
         if kind == "saturated":
             own = read(folder / f"{name}.mat")
-            for method, found in runs(own, ("standard", "map")):
-                rows.append(row("pyshoe", name, "own rests", method, found, found.trajectory.position, truth))
+            here = tuple(m for m in methods if m in ("standard", "map"))
+            rows += [row("pyshoe", name, "own rests", found, truth) for found in runs(own, here)]
     return rows
 
 
-def clipped(data: Path) -> list[dict]:
+def clipped(data: Path, methods: tuple[str, ...]) -> list[dict]:
     folder, rows = data / "pyshoe", []
     for name in tomllib.loads((folder / "splits.toml").read_text())["clip"]:
         recording = read(folder / f"{name}.mat", rest_column="zv_shoe_opt")
         _, truth = load_pyshoe_truth(folder / f"{name}.mat", at=recording.time)
-        whole = estimate(recording, load_config(None, method="standard"))
-        rows.append(row("clipped", name, "unclipped", "standard", whole, whole.trajectory.position, truth))
+        if "standard" in methods:
+            rows.append(row("clipped", name, "unclipped", run(recording, "standard"), truth))
         for rail in (350, 250, 200):
-            for method, found in runs(clip(recording, gyr=rail)):
-                kind = f"{rail} °/s"
-                rows.append(row("clipped", name, kind, method, found, found.trajectory.position, truth))
+            found = runs(clip(recording, gyr=rail), methods)
+            rows += [row("clipped", name, f"{rail} °/s", each, truth) for each in found]
     return rows
 
 
-def gaitmap(data: Path) -> list[dict]:
+def gaitmap(data: Path, methods: tuple[str, ...]) -> list[dict]:
     rows = []
     for side in ("left", "right"):
         path = data / "gaitmap" / "imu_sample_not_rotated.csv"
@@ -84,42 +134,41 @@ def gaitmap(data: Path) -> list[dict]:
         markers = [f"{side[0].upper()}_{marker}" for marker in MARKERS]
         time, truth = load_gaitmap_truth(data / "gaitmap" / "mocap_sample.csv", markers)
         for kind, rails in (("unclipped", {}), ("300 °/s", {"gyr": 300}), ("8 g", {"acc": 8})):
-            for method, found in runs(clip(recording, **rails)):
-                moved = found.trajectory
-                at = np.stack([np.interp(time, moved.time, axis) for axis in moved.position.T], axis=1)
-                rows.append(row("gaitmap", side, kind, method, found, at, truth))
+            for found in runs(clip(recording, **rails), methods):
+                at = np.stack([np.interp(time, found.time, axis) for axis in found.position.T], axis=1)
+                rows.append(row("gaitmap", side, kind, found._replace(time=time, position=at), truth))
     return rows
 
 
 MARKERS = ("FCC", "TOE", "FM5")
 
 
-def against_itself(part: str, path: Path, rails: tuple[int, ...]) -> list[dict]:
+def against_itself(part: str, path: Path, rails: tuple[int, ...], methods: tuple[str, ...]) -> list[dict]:
     recording, rows = read(path), []
-    truth = estimate(recording, load_config(None, method="standard")).trajectory.position
+    truth = run(recording, "standard").position
     for rail in rails:
-        for method, found in runs(clip(recording, gyr=rail)):
-            rows.append(
-                row(part, path.stem, f"{rail} °/s", method, found, found.trajectory.position, truth, False)
-            )
+        found = runs(clip(recording, gyr=rail), methods)
+        rows += [row(part, path.stem, f"{rail} °/s", each, truth, align=False) for each in found]
     return rows
 
 
-def row(part, trial, kind, method, found: Estimate, position, truth, align: bool = True) -> dict:
-    print(part, trial, kind, method, f"{position_rmse(position, truth, align=align):.3f}", flush=True)
-    return {
-        "part": part,
-        "trial": trial,
-        "kind": kind,
-        "method": method,
+def row(part: str, trial: str, kind: str, found: Found, truth, align: bool = True) -> dict:
+    position = found.position
+    scores = {
         "rmse_3d": position_rmse(position, truth, align=align),
         "rmse_2d": position_rmse(position, truth, axes=2, align=align),
         "rmse_z": rms_height(position, truth),
         "pyshoe_3d": pyshoe_error(position, truth, align=align),
-        "saturated": int(found.saturated.sum()),
-        "gaps": len(found.gaps),
-        "not_converged": int((found.fills.status == 1).sum()),
-        "same_as_standard": bool((found.trajectory.position == found.standard_position).all()),
+    }
+    print(part, trial, kind, found.method, f"{scores['rmse_3d']:.3f}", flush=True)
+    return {
+        **dict(zip(KEY, (part, trial, kind, found.method), strict=True)),
+        **scores,
+        "saturated": found.saturated,
+        "gaps": found.gaps,
+        "not_converged": found.not_converged,
+        "same_as_standard": found.same_as_standard,
+        "path": (found.time, position, truth),
     }
 
 
@@ -128,22 +177,24 @@ def rms_height(position, truth) -> float:
     return float(np.sqrt(np.mean((away - away.mean()) ** 2)))
 
 
-def board(table: pd.DataFrame) -> Iterator[Row]:
+def board(table: pd.DataFrame, parts: list[str]) -> Iterator[Row]:
     def of(part, kind, method, column, trial=None) -> np.ndarray:
         at = (table["part"] == part) & (table["kind"] == kind) & (table["method"] == method)
         if trial is not None:
             at &= table["trial"] == trial
         return table.loc[at].set_index("trial")[column].sort_index().to_numpy()
 
+    def methods(part, kind) -> list[str]:
+        there = set(table.loc[(table["part"] == part) & (table["kind"] == kind), "method"])
+        return [method for method in EVERY if method in there]
+
     def lower(metric, value, unit, goal, note) -> Row:
         return Row(metric, float(value), unit, "lower", goal if metric.endswith("_map") else None, None, note)
 
-    parts = set(table["part"])
     if "pyshoe" in parts:
         saturated = "12 saturated trials"
-        for method in METHODS[1:]:
-            kinds = (("saturated", ""), ("own rests", "own_rests_"))
-            for kind, name in kinds if method == "map" else kinds[:1]:
+        for kind, name in (("saturated", ""), ("own rests", "own_rests_")):
+            for method in methods("pyshoe", kind)[1:]:
                 for column, axes in (("rmse_3d", "3d"), ("rmse_2d", "2d")):
                     mine, theirs = (of("pyshoe", kind, m, column) for m in (method, "standard"))
                     ratio, what = geometric_mean_ratio(mine, theirs), f"{saturated}, {kind}"
@@ -151,7 +202,7 @@ def board(table: pd.DataFrame) -> Iterator[Row]:
                     yield lower(metric, ratio, "1", 0.70, f"{what}: geometric mean of the ratio to standard")
                     metric = f"pyshoe_worst_{axes}_{name}{method}"
                     yield lower(metric, (mine / theirs).max(), "1", 1.02, f"{what}: worst of these ratios")
-        for method in METHODS:
+        for method in methods("pyshoe", "saturated"):
             mean = of("pyshoe", "saturated", method, "rmse_3d").mean()
             yield lower(f"pyshoe_mean_3d_{method}", mean, "m", None, f"{saturated}: mean RMSE")
         every = np.concatenate([of("pyshoe", k, "standard", "pyshoe_3d") for k in ("saturated", "other")])
@@ -160,12 +211,13 @@ def board(table: pd.DataFrame) -> Iterator[Row]:
     if "clipped" in parts:
         whole = of("clipped", "unclipped", "standard", "rmse_3d").mean()
         for rail, goal in ((350, 0.98), (250, 0.95), (200, 0.90)):
-            lost = of("clipped", f"{rail} °/s", "standard", "rmse_3d").mean()
+            kind = f"{rail} °/s"
+            lost = of("clipped", kind, "standard", "rmse_3d").mean()
             note = (
                 f"share of what clipping loses that comes back; unclipped {whole:.3f} m, ignored {lost:.3f} m"
             )
-            for method in METHODS[1:]:
-                share = 1 - (of("clipped", f"{rail} °/s", method, "rmse_3d").mean() - whole) / (lost - whole)
+            for method in methods("clipped", kind)[1:]:
+                share = 1 - (of("clipped", kind, method, "rmse_3d").mean() - whole) / (lost - whole)
                 goal_here = goal if method == "map" else None
                 yield Row(f"recovered_{rail}_{method}", float(share), "1", "higher", goal_here, None, note)
     for kind, column, name, goals in (
@@ -174,13 +226,13 @@ def board(table: pd.DataFrame) -> Iterator[Row]:
     ):
         for side, goal in goals.items() if "gaitmap" in parts else ():
             without = of("gaitmap", "unclipped", "standard", column, side)[0]
-            for method in METHODS:
+            for method in methods("gaitmap", kind):
                 value = of("gaitmap", kind, method, column, side)[0]
                 note = f"RMS to motion capture; unclipped {without:.3f} m"
                 yield lower(f"gaitmap_{side}_{name}_{method}", value, "m", goal, note)
     for part, goals in (("openshoe", {350: 0.10, 300: 0.20}), ("xio", {500: 0.05, 400: 0.15})):
         for rail, goal in goals.items() if part in parts else ():
-            for method in METHODS:
+            for method in methods(part, f"{rail} °/s"):
                 value = of(part, f"{rail} °/s", method, "rmse_3d")[0]
                 yield lower(f"{part}_{rail}_{method}", value, "m", goal, "RMS to its own unclipped path")
 
@@ -189,11 +241,58 @@ PARTS = {
     "pyshoe": pyshoe,
     "clipped": clipped,
     "gaitmap": gaitmap,
-    "openshoe": lambda data: against_itself(
-        "openshoe", data / "openshoe" / "Measurement_100521_44.npz", (350, 300)
+    "openshoe": lambda data, methods: against_itself(
+        "openshoe", data / "openshoe" / "Measurement_100521_44.npz", (350, 300), methods
     ),
-    "xio": lambda data: against_itself("xio", data / "xio" / "short_walk.csv", (500, 400)),
+    "xio": lambda data, methods: against_itself("xio", data / "xio" / "short_walk.csv", (500, 400), methods),
 }
+
+
+def merged(before: pd.DataFrame, table: pd.DataFrame, parts: list[str], methods: list[str]) -> pd.DataFrame:
+    """Former rows but those that were run again, or are of methods that are no longer run; then the new ones."""
+    again = before["method"].isin(methods) | ~before["method"].isin(EVERY)
+    rows = before.loc[~(before["part"].isin(parts) & again)].to_dict("records") + table.to_dict("records")
+    # A trial's methods stand together.
+    trials = list(dict.fromkeys(tuple(row[c] for c in KEY[:3]) for row in rows))
+    places = {method: k for k, method in enumerate(EVERY)}
+
+    def place(row: dict) -> tuple[int, int]:
+        return trials.index(tuple(row[c] for c in KEY[:3])), places.get(row["method"], len(EVERY))
+
+    return pd.DataFrame(sorted(rows, key=place))
+
+
+def draw(folder: Path, table: pd.DataFrame, paths: dict[tuple[str, str, str], tuple]) -> None:
+    """The ratios of the saturated PyShoe trials, and the best, median and worst of `map` if they were run."""
+    saturated = table[(table["part"] == "pyshoe") & (table["kind"] == "saturated")]
+    errors = saturated.pivot(index="trial", columns="method", values="rmse_3d")
+    if "map" not in errors:
+        return
+    shown = [method for method in EVERY[1:] if method in errors]
+    ratios = pd.DataFrame({method: errors[method] / errors["standard"] for method in shown}).sort_values(
+        "map"
+    )
+    draw_ratios(folder / "ratios", ratios)
+    for name, place in (("best", 0), ("median", len(ratios) // 2), ("worst", -1)):
+        trial = str(ratios.index[place])
+        drawn = {
+            m: paths[trial, "saturated", m] for m in ("standard", "map") if (trial, "saturated", m) in paths
+        }
+        if len(drawn) == 2:
+            time, _, truth = drawn["map"]
+            tracks = {method: position for method, (_, position, _) in drawn.items()}
+            title = f"PyShoe {trial}: {ratios.loc[trial, 'map']:.2f} of the error of standard"
+            draw_trial(folder / name, time, truth, tracks, title)
+
+
+def installed() -> list[str]:
+    """Every method, but for those of a package that is not there."""
+    try:
+        import_peer("gaitmap")
+    except MissingPeer as missing:
+        print(missing, "Its rows stay as they are.", file=sys.stderr)
+        return [method for method in EVERY if method not in RTS]
+    return list(EVERY)
 
 
 def main() -> int:
@@ -201,28 +300,38 @@ def main() -> int:
     parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("results/accuracy"))
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--methods", nargs="+", choices=EVERY, help="default: every one that is installed")
     parser.add_argument("--gate", action="store_true", help="exit with 1 where something got worse")
     arguments = parser.parse_args()
-    path = arguments.output / "board.json"
+    path, trials = arguments.output / "board.json", arguments.output / "trials.csv"
     former = read_board(path) if path.exists() else []
-    table = pd.DataFrame([row for part in arguments.only for row in PARTS[part](arguments.data)])
-    rows = {r.metric: r for r in former} | {r.metric: r for r in board(table)}
-    found = worse(rows.values(), former, GATE_TOLERANCE) if arguments.gate else []
-    for sentence in found:
+    methods = arguments.methods or installed()
+    found = []
+    for part in arguments.only:
+        here = tuple(m for m in methods if part == "gaitmap" or m not in RTS)
+        found += PARTS[part](arguments.data, here)
+    paths = {tuple(row[c] for c in KEY[1:]): row.pop("path") for row in found}
+    table = pd.DataFrame(found).round(6)
+    if trials.exists():
+        table = merged(pd.read_csv(trials), table, arguments.only, methods)
+    for part in arguments.only:
+        if "standard" not in set(table.loc[table["part"] == part, "method"]):
+            raise InputError(f"{part}: there is no row of standard to compare with; add it to --methods.")
+    rows = {r.metric: r for r in former} | {r.metric: r for r in board(table, arguments.only)}
+    sentences = worse(rows.values(), former, GATE_TOLERANCE) if arguments.gate else []
+    for sentence in sentences:
         print(sentence, file=sys.stderr)
-    if not found:
+    if not sentences:
         arguments.output.mkdir(parents=True, exist_ok=True)
-        trials = arguments.output / "trials.csv"
-        if trials.exists():
-            before = pd.read_csv(trials)
-            table = pd.concat([before[~before["part"].isin(arguments.only)], table])
-        table.round(6).to_csv(trials, index=False)
+        table.to_csv(trials, index=False)
         write_board(path, rows.values(), load_config(None, method="map").model_dump())
-    return 1 if found else 0
+        if "pyshoe" in arguments.only:
+            draw(arguments.output, table, paths)
+    return 1 if sentences else 0
 
 
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except InputError as error:
+    except (InputError, MissingPeer) as error:
         sys.exit(str(error))

@@ -1,6 +1,7 @@
 """Scores: known transforms, invariances, and the real files of motion capture."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.io
 from scipy.optimize import minimize
@@ -15,6 +16,7 @@ from jaxsat.studies.metrics import (
     load_broad_truth,
     load_gaitmap_truth,
     load_pyshoe_truth,
+    load_truth,
     position_rmse,
     pyshoe_error,
 )
@@ -177,6 +179,37 @@ def test_files_that_hold_no_truth_are_named(tmp_path):
         for path in (wrong, tmp_path / "absent"):
             with pytest.raises(InputError, match=path.name):
                 load(path)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_the_truth_of_a_recording_lies_beside_it(tmp_path, walk, suffix):
+    time, names = np.arange(len(walk)) / 50.0, ["pos_x", "pos_y", "pos_z"]
+    table = pd.DataFrame(walk, columns=names).assign(time=time)
+    # Untracked positions are left out.
+    table.loc[20:29, "pos_y"] = np.nan
+    path = tmp_path / f"walk_truth{suffix}"
+    table.to_csv(path, index=False) if suffix == ".csv" else table.to_parquet(path)
+    at, position = load_truth(tmp_path / "walk.csv")
+    np.testing.assert_allclose(position, np.delete(walk, slice(20, 30), axis=0))
+    np.testing.assert_allclose(at, np.delete(time, slice(20, 30)))
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("time,pos_x,pos_y\n0,1,2\n1,2,3\n", "no truth"),
+        ("time,pos_x,pos_y,pos_z\n0,1,2,lost\n1,2,3,lost\n", "no truth"),
+        ("time,pos_x,pos_y,pos_z\n0,1,2,3\n", "fewer than two"),
+        ("time,pos_x,pos_y,pos_z\n1,1,2,3\n0,1,2,3\n", "time does not increase"),
+        ("", "no truth"),
+    ],
+)
+def test_a_truth_that_is_none_is_named(tmp_path, text, sentence):
+    (tmp_path / "walk_truth.csv").write_text(text)
+    with pytest.raises(InputError, match=f"walk_truth.csv: .*{sentence}"):
+        load_truth(tmp_path / "walk.csv")
+    with pytest.raises(InputError, match=r"run.csv: no truth beside it; .* run_truth.csv"):
+        load_truth(tmp_path / "run.csv")
 
 
 def test_attitude_errors_are_those_that_were_put_in():

@@ -11,6 +11,7 @@ from jaxsat.cli.orientation import orientation_command
 from jaxsat.cli.periodic import periodic_command
 from jaxsat.cli.simulate import demo_command, simulate_command
 from jaxsat.cli.sweep import sweep_command
+from jaxsat.cli.tune import tune_command
 from jaxsat.errors import InputError
 
 # What typer raises for wrong arguments; where it lives changed between versions.
@@ -29,6 +30,7 @@ for _name, _command in (
     ("orientation", orientation_command),
     ("periodic", periodic_command),
     ("sweep", sweep_command),
+    ("tune", tune_command),
     ("simulate", simulate_command),
     ("demo", demo_command),
 ):

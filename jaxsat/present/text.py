@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from jaxsat.attitude import Orientation
+from jaxsat.config import Noise
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
@@ -155,3 +156,18 @@ def sweep_text(table: pd.DataFrame, path: Path) -> str:
     ]
     lines += [f"failed: {note}" for note in failed["note"]]
     return "\n".join([*lines, f"table: {path}"])
+
+
+def tuning_text(
+    noise: tuple[Noise, Noise], loss: tuple[float, float], against_truth: bool, names: Sequence[str]
+) -> str:
+    """What `jaxsat tune` prints, and writes above what it found: noise and loss before and after."""
+    units = {"gyr_density": "rad/s/√Hz", "acc_density": "m/s²/√Hz", "rest_velocity_sd": "m/s"}
+    rows = [["", "before", "after", ""]]
+    for name, unit in units.items():
+        rows.append([name, *(f"{getattr(one, name):.4g}" for one in noise), unit])
+    if against_truth:
+        rows.append(["position RMSE", *(f"{np.sqrt(one):.4g}" for one in loss), "m"])
+    else:
+        rows.append(["misfit of a rest", *(f"{one:.4f}" for one in loss), "-log p"])
+    return f"tuned on {plural(len(names), 'recording')}: {', '.join(names)}\n" + columns(rows)

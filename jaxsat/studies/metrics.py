@@ -149,6 +149,32 @@ def load_gaitmap_truth(path: Path, markers: Sequence[str], at: Times | None = No
     return _at(np.arange(len(table)) / _GAITMAP_MOCAP_RATE, position, at, path)
 
 
+def load_truth(recording: Path) -> Track:
+    """Time (s) and position (m) of the truth of a recording: within a PyShoe file, else in a table beside it.
+
+    Beside `walk.csv` that is `walk_truth.csv`, or `.parquet`, with `time` and `pos_x…z`, as `jaxsat simulate` writes
+    it. Raises `InputError` where there is none.
+    """
+    path = Path(recording)
+    if path.suffix == ".mat":
+        return load_pyshoe_truth(path)
+    beside = [path.with_name(f"{path.stem}_truth{suffix}") for suffix in (".parquet", ".csv")]
+    found = [one for one in beside if one.is_file()]
+    if not found:
+        raise InputError(
+            f"{path}: no truth beside it; put time, pos_x, pos_y and pos_z into {beside[1].name}."
+        )
+    try:
+        table = pd.read_parquet(found[0]) if found[0].suffix == ".parquet" else pd.read_csv(found[0])
+        time, position = (table[c].to_numpy(float) for c in ("time", ["pos_x", "pos_y", "pos_z"]))
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{found[0]}: no truth ('time', 'pos_x…z') in it ({error}); check it.") from None
+    kept = np.isfinite(time) & np.isfinite(position).all(axis=1)
+    if kept.sum() < 2 or not np.all(np.diff(time[kept]) > 0):
+        raise InputError(f"{found[0]}: fewer than two positions, or time does not increase; check the file.")
+    return time[kept], position[kept]
+
+
 def load_broad_truth(
     path: Path,
 ) -> tuple[Times, Float[np.ndarray, "M 4"], Float[np.ndarray, "M 3"], Bool[np.ndarray, "M"]]:

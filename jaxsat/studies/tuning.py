@@ -1,16 +1,40 @@
-"""Parameters by gradient of an error against a reference, on trials named for it."""
+"""Parameters by gradient, on recordings named for it: Adam on their logarithms.
 
-from collections.abc import Callable
-from typing import cast
+Gains of the orientation filter by their error against a reference; noise of the standard smoother by the likelihood
+of its rests, or by its error against motion capture. Few parameters and long recordings: gradients are forward-mode,
+at the cost of one more pass a parameter and no memory.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxsat.config import Config, Noise
+from jaxsat.errors import InputError
+from jaxsat.inertial import kalman
 from jaxsat.inertial.orientation import Direction, Estimate, Gains, Start, orientation, up_in_body
+from jaxsat.inertial.smoother import Rows, smooth, update_rows
+from jaxsat.inertial.strapdown import (
+    NavState,
+    Samples,
+    add_error,
+    advance,
+    error_transition,
+    sample_intervals,
+    sample_noise,
+)
+from jaxsat.pipeline import prepare
+from jaxsat.saturation.layout import Trial, pad
+from jaxsat.signals.recording import Recording
+from jaxsat.studies.metrics import Track
+
+Logs = Float[Array, "P"]
 
 
 class Trials(eqx.Module):
@@ -57,37 +81,209 @@ def tune_gains(
     rate: float = 0.2,
     report: Callable[[int, float, Gains], None] = lambda *_: None,
 ) -> Gains:
-    """The gains of least `inclination_loss` on some trials, by Adam on the logarithms of kp, ki and tau.
+    """The gains of least `inclination_loss` on some trials: kp, ki and tau.
 
-    `gate` and `limit` stay as they are, and a zero stays zero. Returns the best of all steps. Three parameters and
-    long recordings: the gradient is forward-mode, at the cost of three more passes and no memory.
+    `gate` and `limit` stay as they are, and a zero stays zero. Returns the best of all steps.
     """
 
-    def loss(logs, frozen: Gains):
-        kp, ki, tau = (jnp.exp(x) for x in logs)
-        return inclination_loss(trials, Gains(kp, ki, tau, frozen.gate, frozen.limit), estimate, direction)
+    def gains(logs: Logs) -> Gains:
+        kp, ki, tau = jnp.exp(logs)
+        return Gains(kp, ki, tau, initial.gate, initial.limit)
 
-    @eqx.filter_jit
-    def value_and_gradient(logs):
-        # One pass carries the value and its three tangents.
+    gradient = eqx.filter_jit(
+        value_and_gradient(lambda logs: inclination_loss(trials, gains(logs), estimate, direction))
+    )
+    first = jnp.log(jnp.stack([initial.kp, initial.ki, initial.tau]))
+    return gains(_descend(gradient, first, steps, rate, lambda k, value, logs: report(k, value, gains(logs))))
+
+
+class NoiseTrial(eqx.Module):
+    """A recording as the standard smoother takes it, with what its noise is made of."""
+
+    trial: Trial
+    measured: Bool[np.ndarray, "N 6"]
+    """The variance of the value is that of the sensor's density."""
+    at_rest: Bool[np.ndarray, ""]
+    """The recording starts at rest."""
+    relinearisations: Int[np.ndarray, ""]
+    position: Float[np.ndarray, "N 3"]
+    """Of the reference (m)."""
+    scored: Bool[np.ndarray, "N"]
+    """Where there is one."""
+
+    def problem(self, noise: Float[Array, "3"]) -> tuple[Samples, Rows, NavState, Float[Array, "9 9"], Array]:
+        """What the smoother is asked with this noise: gyr_density, acc_density, rest_velocity_sd."""
+        trial = jax.tree.map(jnp.asarray, self.trial)
+        density = jnp.repeat(noise[:2], 3)
+        held = jnp.where(trial.period > 0.0, trial.period, 1.0)
+        variance = jnp.where(self.measured, density[None] ** 2 / held[:, None], trial.variance)
+        still = jnp.full_like(trial.period, noise[2] ** 2)
+        rows = Rows(trial.rows.rest, still, trial.rows.height, trial.rows.height_variance)
+        diagonal = jnp.diag(trial.prior_covariance)
+        start = jnp.where(self.at_rest & (jnp.arange(9) >= 6), noise[2] ** 2, diagonal)
+        covariance = trial.prior_covariance + jnp.diag(start - diagonal)
+        return (
+            Samples(trial.signal, trial.period, variance),
+            rows,
+            trial.prior,
+            covariance,
+            trial.gravity,
+        )
+
+
+def noise_trial(recording: Recording, config: Config, truth: Track | None = None) -> NoiseTrial:
+    """A recording prepared for `rest_misfit` and `position_loss`; raises `InputError` as `estimate` does.
+
+    truth: times (s) and positions (m); samples that they do not cover are not scored.
+    """
+    with jax.enable_x64(True):
+        prepared = prepare(recording, config)
+    n, size = len(recording), len(prepared.trial.signal)
+    density = np.repeat([config.noise.gyr_density, config.noise.acc_density], 3)
+    plain = np.isclose(prepared.trial.variance[:n], density**2 / recording.period, rtol=1e-9, atol=0.0)
+    position, scored = np.zeros((n, 3)), np.zeros(n, bool)
+    if truth is not None:
+        time, track = truth
+        scored = (recording.time >= time[0]) & (recording.time <= time[-1])
+        position = np.stack([np.interp(recording.time, time, axis) for axis in track.T], axis=1)
+        if not scored.any():
+            raise InputError(
+                f"{recording.name}: motion capture from {time[0]:.3f} to {time[-1]:.3f} s covers none of the "
+                f"recording's {recording.time[0]:.3f} to {recording.time[-1]:.3f} s; put both on one clock."
+            )
+    return NoiseTrial(
+        prepared.trial,
+        pad(plain, size),
+        np.asarray(prepared.rest[0]),
+        np.asarray(config.smoother.relinearisations),
+        pad(position, size),
+        pad(scored, size),
+    )
+
+
+def rest_misfit(trial: NoiseTrial, noise: Float[Array, "3"]) -> Float[Array, ""]:
+    """Minus the log-likelihood of the velocities (and heights) at rest, without its constant.
+
+    The prediction-error form of Schweppe (IEEE Trans. Inf. Theory 1965, 11(1), 61-70), ½ Σ (e²/s + log s) over the
+    innovations e and their variances s of the smoother's extended Kalman filter: J* of Eq. 14 with the determinants
+    that keep noise from growing.
+    """
+    samples, rows, prior, covariance, gravity = trial.problem(noise)
+
+    def step(carry, inputs):
+        state, covariance, total = carry
+        interval, sample, row = inputs
+        error, covariance, cost, done = update_rows(jnp.zeros(9), covariance, state, row)
+        weight = jnp.stack([one.weight for one in done])
+        seen = weight > 0.0
+        total = total + cost - 0.5 * jnp.sum(jnp.where(seen, jnp.log(jnp.where(seen, weight, 1.0)), 0.0))
+        state = add_error(state, error)
+        transition = error_transition(state.q_nb, interval)
+        spread = sample_noise(state.q_nb, sample.signal, sample.period, sample.variance)
+        _, covariance = kalman.predict(error, covariance, transition, error, spread)
+        return (advance(state, interval, gravity), covariance, total), None
+
+    intervals = sample_intervals(samples.signal, samples.period)
+    carry = (prior, covariance, jnp.zeros(()))
+    (_, _, total), _ = jax.lax.scan(step, carry, (intervals, samples, rows))
+    return total
+
+
+def position_loss(trial: NoiseTrial, noise: Float[Array, "3"]) -> Float[Array, ""]:
+    """Mean squared position error of the standard smoother (m²), turned about z and shifted onto the reference."""
+    found = smooth(*trial.problem(noise), jnp.asarray(trial.relinearisations)).state.position[:-1]
+    weight = jnp.where(trial.scored, 1.0, 0.0)[:, None] / jnp.sum(trial.scored, dtype=found.dtype)
+    true = jnp.asarray(trial.position)
+    centred, truth = (x - jnp.sum(weight * x, axis=0)[None] for x in (found, true))
+    # As metrics.align_yaw_translation: the best turn is that of the sums of inner and outer products.
+    inner = jnp.sum(weight[:, 0] * (centred[:, 0] * truth[:, 0] + centred[:, 1] * truth[:, 1]))
+    outer = jnp.sum(weight[:, 0] * (centred[:, 0] * truth[:, 1] - centred[:, 1] * truth[:, 0]))
+    return jnp.sum(weight * (centred**2 + truth**2)) - 2.0 * (
+        jnp.hypot(inner, outer) + jnp.sum(weight[:, 0] * centred[:, 2] * truth[:, 2])
+    )
+
+
+class TunedNoise(NamedTuple):
+    """What `tune_noise` found; the loss is a mean over samples at rest (likelihood) or recordings (m²)."""
+
+    noise: Noise
+    before: float
+    after: float
+
+
+def tune_noise(
+    trials: Sequence[NoiseTrial],
+    initial: Noise,
+    *,
+    against_truth: bool = False,
+    steps: int = 40,
+    rate: float = 0.2,
+    report: Callable[[int, int], None] = lambda *_: None,
+) -> TunedNoise:
+    """The noise under which the rests of some recordings are likeliest, or their positions least in error.
+
+    gyr_density, acc_density and rest_velocity_sd are searched from `initial` on; initial_tilt_sd stays. Returns the
+    best of all steps, computed in float64 whatever JAX's setting. report: called with (steps done, steps in all).
+    Raises `InputError` where there is no recording, or a loss is not finite.
+    """
+    if not trials or steps < 1:
+        raise InputError("tune: there is nothing to do; give at least one recording and one step.")
+    loss = position_loss if against_truth else rest_misfit
+    count = len(trials) if against_truth else sum(int(np.sum(t.trial.rows.rest)) for t in trials)
+    with jax.enable_x64(True):
+        gradient = eqx.filter_jit(value_and_gradient(lambda logs, trial: loss(trial, jnp.exp(logs))))
+
+        def together(logs: Logs) -> tuple[Array, Array]:
+            values, slopes = zip(*(gradient(logs, trial) for trial in trials), strict=True)
+            return jnp.sum(jnp.stack(values)) / count, jnp.sum(jnp.stack(slopes), axis=0) / count
+
+        first = jnp.log(jnp.asarray([initial.gyr_density, initial.acc_density, initial.rest_velocity_sd]))
+        values: list[float] = []
+
+        def note(k: int, value: float, _: Logs) -> None:
+            values.append(value)
+            report(k + 1, steps)
+
+        best = np.exp(np.asarray(_descend(together, first, steps, rate, note)))
+    if not np.isfinite(values).all():
+        raise InputError(
+            "tune: the loss is not finite; start from other noise, or leave out recordings that do not fit."
+        )
+    gyr, acc, still = (float(f"{x:.4g}") for x in best)
+    found = initial.model_copy(update={"gyr_density": gyr, "acc_density": acc, "rest_velocity_sd": still})
+    return TunedNoise(found, values[0], min(values))
+
+
+def value_and_gradient(loss: Callable[..., Float[Array, ""]]) -> Callable[..., tuple[Array, Array]]:
+    """Value and gradient of a loss of few logarithms (and data): one pass carries the value and its tangents."""
+
+    def both(logs: Logs, *data):
         value, tangents = jax.vmap(
-            lambda tangent: jax.jvp(lambda x: loss(x, initial), (logs,), (tangent,)), out_axes=(None, 0)
-        )(jnp.eye(3, dtype=logs.dtype))
+            lambda tangent: jax.jvp(lambda x: loss(x, *data), (logs,), (tangent,)), out_axes=(None, 0)
+        )(jnp.eye(len(logs), dtype=logs.dtype))
         return value, jnp.where(jnp.isfinite(logs), tangents, 0.0)
 
-    logs = jnp.log(jnp.stack([initial.kp, initial.ki, initial.tau]))
-    optimiser = optax.adam(rate)
+    return both
+
+
+def _descend(
+    gradient: Callable[[Logs], tuple[Array, Array]],
+    first: Logs,
+    steps: int,
+    rate: float,
+    report: Callable[[int, float, Logs], None],
+) -> Logs:
+    """Adam from `first` on; the best of all steps."""
+    logs, optimiser = first, optax.adam(rate)
     state = optimiser.init(logs)
     best, lowest = logs, np.inf
     for k in range(steps):
-        value, gradient = value_and_gradient(logs)
-        kp, ki, tau = jnp.exp(logs)
-        report(k, float(value), Gains(kp, ki, tau, initial.gate, initial.limit))
+        value, slope = gradient(logs)
+        report(k, float(value), logs)
         if float(value) < lowest:
             best, lowest = logs, float(value)
         # Optax counts in integers and mixes them with floats.
         with jax.numpy_dtype_promotion("standard"):
-            updates, state = optimiser.update(gradient, state)
+            updates, state = optimiser.update(slope, state)
             logs = cast(Array, optax.apply_updates(logs, updates))
-    kp, ki, tau = jnp.exp(best)
-    return Gains(kp, ki, tau, initial.gate, initial.limit)
+    return best

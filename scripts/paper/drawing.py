@@ -22,6 +22,8 @@ LABELS = {
     "triangle": "method 2, triangle",
     "quadratic": "method 2, quadratic",
     "map": "map",
+    "spline": "cubic spline",
+    "second_difference": "least second difference",
     "unclipped": "never clipped",
 }
 # Okabe and Ito's colours, in steps of lightness too; a line style and a marker each.
@@ -33,9 +35,20 @@ STYLES: dict[str, dict[str, Any]] = {
     "triangle": {"color": "#E69F00", "ls": (0, (5, 1.5)), "lw": 1.5},
     "quadratic": {"color": "#009E73", "ls": (0, (4, 1, 1, 1)), "lw": 1.5},
     "map": {"color": "#D55E00", "ls": (0, (2.5, 1)), "lw": 2.0},
+    "spline": {"color": "#CC79A7", "ls": (0, (3, 1, 1, 1)), "lw": 1.5},
+    "second_difference": {"color": "#56B4E9", "ls": (0, (1, 0.7)), "lw": 1.5},
     "unclipped": {"color": "black", "ls": ":", "lw": 1.2},
 }
-MARKERS = {"standard": "X", "direct": "o", "triangle": "^", "quadratic": "s", "map": "D", "unclipped": "P"}
+MARKERS = {
+    "standard": "X",
+    "direct": "o",
+    "triangle": "^",
+    "quadratic": "s",
+    "map": "D",
+    "spline": "v",
+    "second_difference": "<",
+    "unclipped": "P",
+}
 
 plt.rcParams.update(
     {

@@ -1,4 +1,4 @@
-"""What jaxsat's speed is compared with, each peer checked against jaxsat first.
+"""What jaxsat is compared with: its speed, each peer checked against jaxsat first, and its accuracy.
 
     python -m scripts.peers --check      # every peer computes what jaxsat computes
     python -m scripts.peers --time       # how long each takes
@@ -7,6 +7,7 @@
 - `strapdown`: a bare pass over the samples, compiled by numba; nothing that looks at each sample can do less.
 - `paper_way`: δ of one segment as in Dang & Suh 2014, a dense quadratic problem inside a generic solver.
 - `smoothers`: the linear smoother by dynamax and by cuthbert, general libraries in JAX.
+- `fills`, `gaitmap_rts`: saturated samples filled from the signal alone, and gaitmap's smoother, for accuracy.
 
 A peer that is not installed raises `MissingPeer`; `pip install jaxsat[bench]` brings all of them.
 """

@@ -1,0 +1,92 @@
+"""The accuracy board's own parts: fills of its peers against what they minimise, and rows kept or replaced."""
+
+import importlib
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxsat.signals.recording import Recording
+
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+
+
+@pytest.fixture(scope="module")
+def board():
+    sys.path.insert(0, str(SCRIPTS))
+    try:
+        yield importlib.import_module("accuracy")
+    finally:
+        sys.path.remove(str(SCRIPTS))
+
+
+@pytest.fixture
+def fills(board):
+    return importlib.import_module("peers.fills")
+
+
+def test_a_spline_finds_a_cubic_and_the_other_fill_a_line_and_the_least_bend(fills):
+    t, lost = np.linspace(-1.0, 1.0, 40), np.zeros(40, bool)
+    lost[8:12] = lost[20:27] = lost[28] = True
+    cubic = 2.0 * t**3 - t**2 + 0.5
+    np.testing.assert_allclose(fills.spline(np.where(lost, 0.0, cubic), lost), cubic, atol=1e-12)
+    np.testing.assert_allclose(
+        fills.second_difference(np.where(lost, 0.0, 3.0 * t), lost), 3.0 * t, atol=1e-12
+    )
+    bent = np.random.default_rng(0).normal(size=40)
+    second = np.diff(np.eye(40), 2, axis=0)
+    best = np.linalg.lstsq(second[:, lost], -second[:, ~lost] @ bent[~lost])[0]
+    found = fills.second_difference(bent, lost)
+    np.testing.assert_allclose(found[lost], best, atol=1e-10)
+    np.testing.assert_array_equal(found[~lost], bent[~lost])
+
+
+@pytest.mark.parametrize("name", ["spline", "second_difference"])
+def test_what_is_filled_lies_beyond_its_rail_and_the_rest_is_as_measured(fills, name):
+    n, T = 400, 0.005
+    time = T * np.arange(n)
+    signal = np.sin(2 * np.pi * np.array([1, 2, 3, 1, 2, 3]) * time[:, None]) + 0.1
+    true, rail = signal.copy(), np.array([0.8, 9.0, 0.9, 0.7, 9.0, 9.0])
+    signal = np.clip(signal, -rail, rail)
+    sign = np.where(signal != true, np.sign(true), 0.0).astype(int)
+    # A lone sample lower than both of its neighbours would be filled below its rail; an end has one neighbour.
+    signal[150, 1], sign[150, 1] = 2.0, 1
+    sign[:3, 4] = 1
+    recording = Recording(time, signal[:, :3], signal[:, 3:], np.zeros((n, 6), bool))
+    rest = np.arange(n) < 9
+    found = fills.filled(recording, SimpleNamespace(sign=sign, rest=rest), name)
+    assert np.all(sign * (found.signal - signal) >= 0.0)
+    np.testing.assert_array_equal(found.signal[sign == 0], signal[sign == 0])
+    np.testing.assert_array_equal(found.signal[:3, 4], signal[:3, 4])
+    np.testing.assert_array_equal(found.rest, rest)
+    assert found.signal[150, 1] == 2.0
+    lost = sign[:, 0] != 0
+    assert np.abs(found.signal - true)[lost, 0].max() < 0.5 * np.abs(signal - true)[lost, 0].max()
+
+
+def test_rows_that_were_run_again_replace_the_former_and_keep_their_place(board):
+    def rows(*names):
+        return pd.DataFrame(
+            [{**dict(zip(board.KEY, name, strict=True)), "rmse_3d": float(k)} for k, name in enumerate(names)]
+        )
+
+    before = rows(
+        ("xio", "a", "500", "standard"),
+        ("xio", "a", "500", "forgotten"),
+        ("xio", "a", "500", "map"),
+        ("xio", "a", "400", "standard"),
+        ("gaitmap", "left", "8 g", "forgotten"),
+    )
+    new = rows(("xio", "a", "500", "spline"), ("xio", "a", "400", "map"), ("xio", "a", "500", "map"))
+    table = board.merged(before, new, ["xio"], ["spline", "map"])
+    assert [tuple(row) for row in table.to_numpy()] == [
+        ("xio", "a", "500", "standard", 0.0),
+        ("xio", "a", "500", "map", 2.0),
+        ("xio", "a", "500", "spline", 0.0),
+        ("xio", "a", "400", "standard", 3.0),
+        ("xio", "a", "400", "map", 1.0),
+        ("gaitmap", "left", "8 g", "forgotten", 4.0),
+    ]
