@@ -273,6 +273,8 @@ def eq21(chosen: Settings, out: Path) -> None:
             formula=name,
             usable=np.asarray(usable),
             time=np.asarray(time) - true,
+            off=np.abs(np.asarray(time) - true),
+            gap=gap.sum(axis=1),
             height=np.asarray(height),
             fill_rmse=np.sqrt((missed**2).sum(axis=1) / gap.sum(axis=1)),
             impulse=missed.sum(axis=1) / chosen["rate"],
@@ -281,7 +283,7 @@ def eq21(chosen: Settings, out: Path) -> None:
     groups = pd.concat(rows).groupby(["rail", "formula"], sort=False)
     columns = {
         f"{column}_{label}": groups[column].quantile(q)
-        for column in ("time", "height", "fill_rmse", "impulse")
+        for column in ("time", "off", "gap", "height", "fill_rmse", "impulse")
         for label, q in zip(("low", "median", "high"), QUANTILES, strict=True)
     }
     table = pd.DataFrame({"usable": groups["usable"].mean(), **columns}).reset_index()

@@ -33,7 +33,7 @@ def simulated(chosen: Settings, out: Path) -> None:
     values = np.concatenate([values_of(chosen, each, [bound]) for each in (rails, {})])
     rows = summary(beside_unclipped(score(trials, values, chosen["chunk"])), [], COLUMNS)
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
-    drawing.ratios(out / "errors", rows, "last", chosen["paper"]["last"], "m")
+    drawing.errors(out / "errors", rows, "last", chosen["paper"]["last"], "last-position error", "m")
     recording, truth, config = clipped(chosen, 0)
     found = estimates(recording, config, SHOWN)
     drawing.plan(
