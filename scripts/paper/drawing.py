@@ -219,18 +219,12 @@ def bands(
     for label, at in marks.items():
         panel.axvline(at, color="0.3", lw=0.8, ls=":")
         panel.annotate(
-            label,
-            (at, 0.98),
-            xycoords=("data", "axes fraction"),
-            rotation=90,
-            fontsize=8,
-            ha="right",
-            va="top",
+            label, (at, 1.01), xycoords=("data", "axes fraction"), fontsize=8, ha="center", va="bottom"
         )
     panel.set(xlabel=xlabel, ylabel=ylabel, yscale="log")
     plain_log(panel.yaxis)
-    panel.set_title(title or "lines: median over the seeds; bands: 5 to 95 %", fontsize=8)
-    panel.legend(fontsize=8)
+    panel.set_title(title or "lines: median over the seeds; bands: 5 to 95 %", fontsize=8, pad=16)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
     save(figure, path)
 
 
