@@ -25,9 +25,9 @@ FIGURES = {
     "errors": "error",
     "path": "path",
     "filled": "the saturated signal, filled",
-    "intervals": "errors and intervals",
+    "intervals": "coordinates of the end within some sd of the truth",
     "descent": "J along the search",
-    "peaks": "peaks",
+    "peaks": "how far off its peaks are",
 }
 
 
