@@ -131,7 +131,7 @@ def swing(path: Path, time: Float[np.ndarray, "N"], tracks: Tracks) -> None:
 
 
 def travel(path: Path, time: Float[np.ndarray, "N"], tracks: Tracks) -> None:
-    """Figure 13: the distance along x over time, and what it is short of."""
+    """Figures 13 and 16: the distance along x over time, and what it is short of."""
     figure, (way, short) = panels(1, 2, 9.0, 3.2)
     for name, track in tracks.items():
         line(way, time, track[:, 0], name)

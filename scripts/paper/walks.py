@@ -36,9 +36,8 @@ def simulated(chosen: Settings, out: Path) -> None:
     drawing.errors(out / "errors", rows, "last", chosen["paper"]["last"], "last-position error", "m")
     recording, truth, config = clipped(chosen, 0)
     found = estimates(recording, config, SHOWN)
-    drawing.plan(
-        out / "path", {"truth": truth.position, **{m: e.trajectory.position for m, e in found.items()}}
-    )
+    tracks = {"truth": truth.position, **{m: e.trajectory.position for m, e in found.items()}}
+    drawing.travel(out / "path", truth.time, tracks)
 
 
 def saturated(chosen: Settings, out: Path, data: Path) -> None:
