@@ -80,9 +80,8 @@ def board(out: Path, done: Mapping[str, Settings]) -> Iterator[Row]:
                 yield Row(f"coverage_{column}_{row['method']}", row[column], "1", "higher", 0.95, None, note)
     took = [json.loads((out / name / "env.json").read_text()) for name in done]
     cpu = sum(each.get("cpu_seconds", np.nan) for each in took) / 60.0
-    note = (
-        f"{len(done)} experiments in several runs, each of which started anew, on cores that others used too; "
-        + (f"processor time {cpu:.1f} min" if np.isfinite(cpu) else "processor time was not taken of all")
+    note = f"{len(done)} experiments in several runs that traced, some compiled, anew on shared cores; " + (
+        f"processor time {cpu:.1f} min" if np.isfinite(cpu) else "processor time was not taken of all"
     )
     yield Row("paper_minutes", sum(each["seconds"] for each in took) / 60.0, "min", "lower", 10.0, None, note)
 
