@@ -43,17 +43,18 @@ EXPERIMENTS = {
 
 def run(name: str, out: Path, data: Path, quick: bool = False) -> Settings:
     """Run one experiment into a folder of its name; returns its settings."""
-    chosen, folder, begin = settings(name, quick), out / name, time.perf_counter()
+    chosen, folder = settings(name, quick), out / name
+    begin, worked = time.perf_counter(), time.process_time()
     folder.mkdir(parents=True, exist_ok=True)
     experiment = EXPERIMENTS[name]
     if name == "walk_saturated":
         experiment = partial(experiment, data=data)
     with jax.enable_x64(True):
         experiment(chosen, folder)
-    seconds = round(time.perf_counter() - begin, 1)
-    environment = {**machine(), "seconds": seconds, "settings": chosen}
+    seconds, cpu = round(time.perf_counter() - begin, 1), round(time.process_time() - worked, 1)
+    environment = {**machine(), "seconds": seconds, "cpu_seconds": cpu, "settings": chosen}
     (folder / "env.json").write_text(json.dumps(environment, indent=2, ensure_ascii=False) + "\n")
-    print(f"{name}: {seconds} s", flush=True)
+    print(f"{name}: {seconds} s ({cpu} s of processor time)", flush=True)
     return chosen
 
 

@@ -1,6 +1,7 @@
 """The paper reproduced: a fast version of each experiment runs, and shows what it is there to show.
 
-All simulated motions share one compiled program, the most of the time when none is in the cache.
+All simulated motions share one compiled program, minutes of compiling when it is not in the cache: what needs it is
+slow. Eq. 21 searches nothing and needs none of it.
 """
 
 import importlib
@@ -11,9 +12,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-
-# The program alone is minutes of compiling.
-pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = ("direct", "triangle", "quadratic", "map")
@@ -57,6 +55,7 @@ def test_every_experiment_has_its_settings_and_a_method_for_each_goal(script):
         assert set(whole) == set(quick) and whole["title"] and whole["about"]
 
 
+@pytest.mark.slow
 def test_table_1_each_method_beats_the_ratio_of_the_paper(run):
     table = run("bar")
     assert of(table, "standard")["last_ratio_median"] == 1.0
@@ -65,45 +64,55 @@ def test_table_1_each_method_beats_the_ratio_of_the_paper(run):
         assert of(table, method)["saturated"] > 10
 
 
+@pytest.mark.slow
 def test_figure_9_a_bound_below_what_the_peak_needs_costs_accuracy(run):
     table = run("rail_direct").query("method == 'direct'").sort_values("gyr_rail")
-    short, enough = table["last_median"]
-    assert short > 3 * enough and table["at_bound_median"].iloc[0] > 0
+    short, enough = table["fill_rmse_gyr_median"]
+    assert short > 2 * enough and table["last_median"].iloc[0] > table["last_median"].iloc[1]
+    assert table["at_bound_median"].iloc[0] > 0 == table["at_bound_median"].iloc[1]
 
 
+@pytest.mark.slow
 def test_figure_10_method_2_holds_where_method_1_is_bound(run):
     shapes, bound = run("rail_shapes"), run("rail_direct")
     low = shapes["gyr_rail"].min()
     for method in ("triangle", "quadratic"):
         mine = of(shapes[shapes["gyr_rail"] == low], method)
-        assert mine["last_median"] < of(bound[bound["gyr_rail"] == low], "direct")["last_median"]
+        theirs = of(bound[bound["gyr_rail"] == low], "direct")
+        assert mine["fill_rmse_gyr_median"] < theirs["fill_rmse_gyr_median"]
 
 
+@pytest.mark.slow
 def test_figure_11_a_larger_bound_does_no_harm(run):
     table = run("bound").query("method == 'direct'").sort_values("gyr_bound")
     assert table["last_median"].iloc[0] > 3 * table["last_median"].iloc[-1]
 
 
+@pytest.mark.slow
 def test_table_2_a_push_that_saturates_comes_back_from_the_rest_after_it(run):
     table = run("straight")
     assert of(table, "direct")["last_ratio_median"] < 0.5
     assert 0.05 < of(table, "standard")["last_median"] < 0.2
 
 
+@pytest.mark.slow
 def test_table_2_what_cancels_in_velocity_the_rest_does_not_see(run):
     table = run("straight_even")
     assert of(table, "direct")["last_ratio_median"] > 0.9
 
 
+@pytest.mark.slow
 def test_table_3_start_and_stop_of_a_curve(run):
     assert of(run("planar"), "direct")["distance_ratio_median"] < 1.0
 
 
+@pytest.mark.slow
 def test_figure_16_a_stride(run):
     table = run("walk")
     assert of(table, "direct")["last_ratio_median"] < 0.391
 
 
+@pytest.mark.slow
 def test_section_5_both_orders_agree_on_one_segment(run):
     table = run("segments").set_index("order")
     assert table.loc["sequential", "last_median"] == pytest.approx(
@@ -111,17 +120,20 @@ def test_section_5_both_orders_agree_on_one_segment(run):
     )
 
 
+@pytest.mark.slow
 def test_intervals_are_counted(run):
     table = run("coverage")
     assert table[["fill", "end"]].to_numpy().max() <= 1.0 and table["sd_median"].min() > 0.0
 
 
+@pytest.mark.slow
 def test_the_search_descends(run):
     table = run("iterations")
     best = table["best"].to_numpy()
     assert np.all(np.diff(best) <= 0.0) and best[-1] < best[0]
 
 
+@pytest.mark.slow
 def test_with_a_prior_every_start_ends_alike(run):
     table = run("starts")
     assert np.ptp(table["cost"]) < 1e-3 * table["cost"].iloc[0] and table["away"].max() < 0.1
@@ -131,9 +143,11 @@ def test_equation_21_as_printed_puts_peaks_outside_their_gaps(run):
     table = run("eq21").set_index("formula")
     assert table.loc["corrected", "usable"].min() == 1.0
     assert table.loc["printed", "usable"].max() < 0.5
-    assert table.loc["corrected", "time_median"].abs().max() < 2.0
+    assert table.loc["corrected", "off_median"].max() < 2.0
+    assert (table.loc["printed", "off_median"] > 0.5 * table.loc["printed", "gap_median"]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["walk_clipped", "walk_saturated"])
 def test_figure_16_on_real_walks(run, name, request):
     if name == "walk_saturated":
@@ -142,6 +156,7 @@ def test_figure_16_on_real_walks(run, name, request):
     assert set(table["method"]) == {"standard", "direct"} and table["last"].between(0.0, 10.0).all()
 
 
+@pytest.mark.slow
 def test_the_board_and_the_page_tell_what_was_run(run, script):
     run("bar")
     rows = {row.metric: row for row in script.page.board(run.out, run.done)}

@@ -12,7 +12,9 @@ from jaxtyping import Float
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 LABELS = {
     "truth": "truth",
@@ -79,6 +81,13 @@ def panels(rows: int, columns: int, width: float, height: float, **options) -> t
     return figure, list(axes.ravel())
 
 
+def plain_log(axis: Axis) -> None:
+    """A logarithmic axis with 1 and 3 written out: 0.003, not 3 × 10⁻³."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def line(panel: Axes, x, y, name: str, label: str | None = None, **changes) -> None:
     panel.plot(x, y, label=LABELS[name] if label is None else label, **{**STYLES[name], **changes})
 
@@ -94,23 +103,21 @@ def filled(
     around: tuple[float, float],
 ) -> None:
     """Figures 6, 8 and 12: the true, the saturated and the filled signal; methods 1 and `map`, and method 2."""
-    figure, axes = panels(1, 2, 9.0, 3.2, sharey=True)
+    figure, axes = panels(1, 2, 9.0, 3.8, sharey=True)
     shown = (time >= around[0]) & (time <= around[1])
     lost = measured != true
     for panel, methods in zip(axes, (("direct", "map"), ("triangle", "quadratic")), strict=True):
         line(panel, time[shown], true[shown], "truth", "true, unclipped")
+        line(panel, time[shown], measured[shown], "measured")
         for method in methods:
-            line(panel, time[shown], found[method][shown], method)
-        line(panel, time[shown], measured[shown], "measured", "measured")
+            wrong = float(np.sqrt(np.mean((found[method] - true)[lost] ** 2)))
+            label = f"{LABELS[method]} (RMS error {wrong:.2g})"
+            line(panel, time[shown], found[method][shown], method, label)
         panel.axhline(rail, color="0.2", lw=0.8, ls=":")
         panel.annotate("rail", (around[0], rail), fontsize=8, va="bottom", color="0.2")
         panel.set(xlabel="time (s)")
-        panel.legend(loc="lower center", fontsize=8)
+        panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
     axes[0].set(ylabel=quantity)
-    error = {m: np.sqrt(np.mean((x - true)[lost] ** 2)) for m, x in found.items()} if lost.any() else {}
-    for panel, methods in zip(axes, (("direct", "map"), ("triangle", "quadratic")), strict=True):
-        told = ", ".join(f"{LABELS[m]} {error[m]:.2g}" for m in methods if m in error)
-        panel.set_title(f"RMS error in the gap: {told}", fontsize=8)
     save(figure, path)
 
 
@@ -127,7 +134,7 @@ def swing(path: Path, time: Float[np.ndarray, "N"], tracks: Tracks) -> None:
     for axis, centre in zip("xyz", (tracks["truth"].max(0) + tracks["truth"].min(0)) / 2, strict=True):
         getattr(space, f"set_{axis}lim")(centre - 1.2 * reach, centre + 1.2 * reach)
         getattr(space, f"set_{axis}label")(f"{axis} (m)")
-    space.locator_params(nbins=5)
+    space.locator_params(nbins=4)
     space.view_init(elev=18, azim=-70)
     space.set_box_aspect((1, 1, 1), zoom=0.85)
     panel.set(xlabel="time (s)", ylabel="distance from the truth (m)", yscale="log", ylim=(1e-5, 2.0))
@@ -137,7 +144,7 @@ def swing(path: Path, time: Float[np.ndarray, "N"], tracks: Tracks) -> None:
 
 
 def travel(path: Path, time: Float[np.ndarray, "N"], tracks: Tracks) -> None:
-    """Figure 13: the distance along x over time, and what it is short of."""
+    """Figures 13 and 16: the distance along x over time, and what it is short of."""
     figure, (way, short) = panels(1, 2, 9.0, 3.2)
     for name, track in tracks.items():
         line(way, time, track[:, 0], name)
@@ -160,17 +167,23 @@ def plan(path: Path, tracks: Tracks, title: str = "", size: tuple[float, float] 
             color=STYLES[name]["color"],
             ms=8 if name != "truth" else 14,
             alpha=STYLES[name].get("alpha", 1.0),
-            mec="white",
+            # Hollow: they may lie on one another.
+            mfc="none",
+            mew=1.8,
             zorder=3,
         )
-    panel.plot(0, 0, marker="|", ms=14, mew=2, color="black")
-    panel.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    panel.set_title(title or "markers: last positions", fontsize=8)
+    panel.plot(*tracks["truth"][0, :2], marker="|", ms=14, mew=2, color="black")
+    panel.set(xlabel="x (m)", ylabel="y (m)")
+    # Limits give way, not the box: it keeps its place in the layout.
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.set_title("; ".join(filter(None, [title, "bar: start, markers: last positions"])), fontsize=8)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     save(figure, path)
 
 
-def ratios(path: Path, rows: pd.DataFrame, column: str, paper: Mapping[str, float], unit: str) -> None:
+def errors(
+    path: Path, rows: pd.DataFrame, column: str, paper: Mapping[str, float], what: str, unit: str
+) -> None:
     """The errors of a table: ours with their spread over the seeds, the paper's beside them."""
     figure, (panel,) = panels(1, 1, 6.5, 2.6)
     methods = [m for m in LABELS if m in set(rows["method"])]
@@ -186,7 +199,8 @@ def ratios(path: Path, rows: pd.DataFrame, column: str, paper: Mapping[str, floa
     panel.plot([], [], "k-", lw=5, alpha=0.4, label="5 to 95 %")
     panel.plot([], [], "k|", ms=12, mew=2, label="the paper")
     panel.set_yticks(range(len(methods)), [LABELS[m] for m in reversed(methods)])
-    panel.set(xscale="log", xlabel=f"error ({unit})")
+    panel.set(xscale="log", xlabel=f"{what} ({unit})", ylim=(-0.6, len(methods) - 0.4))
+    plain_log(panel.xaxis)
     panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     save(figure, path)
 
@@ -218,17 +232,12 @@ def bands(
     for label, at in marks.items():
         panel.axvline(at, color="0.3", lw=0.8, ls=":")
         panel.annotate(
-            label,
-            (at, 0.98),
-            xycoords=("data", "axes fraction"),
-            rotation=90,
-            fontsize=8,
-            ha="right",
-            va="top",
+            label, (at, 1.01), xycoords=("data", "axes fraction"), fontsize=8, ha="center", va="bottom"
         )
     panel.set(xlabel=xlabel, ylabel=ylabel, yscale="log")
-    panel.set_title(title or "lines: median over the seeds; bands: 5 to 95 %", fontsize=8)
-    panel.legend(fontsize=8)
+    plain_log(panel.yaxis)
+    panel.set_title(title or "lines: median over the seeds; bands: 5 to 95 %", fontsize=8, pad=16)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
     save(figure, path)
 
 

@@ -1,34 +1,28 @@
 """Figures that the paper does not have."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import LogLocator
+from scipy.stats import chi
 
-from .drawing import LABELS, MARKERS, STYLES, line, panels, save
+from .drawing import LABELS, MARKERS, STYLES, line, panels, plain_log, save
 
 
-def coverage(path: Path, table: pd.DataFrame) -> None:
-    """The error of the last position of each seed against the sd that is given for it."""
+def coverage(path: Path, ends: Mapping[str, list[float]]) -> None:
+    """How many coordinates of last positions lie within how many sd of the truth, and how many should."""
     figure, (panel,) = panels(1, 1, 5.5, 3.8)
-    for method, rows in table.groupby("method", sort=False):
-        name = str(method)
-        held = rows["end"].mean()
-        panel.plot(
-            1e3 * rows["sd"],
-            1e3 * rows["error"],
-            MARKERS[name],
-            color=STYLES[name]["color"],
-            ms=4,
-            alpha=0.7,
-            label=f"{LABELS[name]}: 95 % intervals hold {held:.0%}",
-        )
-    ends = 1e3 * np.array([table["sd"].min() * 0.8, table["sd"].max() * 1.25])
-    panel.plot(ends, ends, "k-", lw=0.8, label="error = sd")
-    panel.set(
-        xscale="log", yscale="log", xlabel="sd of the last position (mm)", ylabel="its error (mm)", xlim=ends
-    )
-    panel.legend(fontsize=8, loc="lower right")
+    reach = np.linspace(0.0, 3.0, 200)
+    panel.plot(reach, 100.0 * chi(1).cdf(reach), label="as many as should", **STYLES["truth"])
+    for method, away in ends.items():
+        line(panel, reach, [100.0 * np.mean(np.array(away) <= x) for x in reach], method)
+    panel.axvline(1.96, color="0.3", lw=0.8, ls=":")
+    panel.annotate("1.96 sd", (1.96, 2.0), fontsize=8, rotation=90, ha="right", va="bottom")
+    panel.set(xlabel="half-width of the interval (sd)", ylabel="coordinates of the end inside (%)")
+    panel.set(xlim=(0.0, 3.0), ylim=(0.0, 101.0))
+    panel.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.05))
     save(figure, path)
 
 
@@ -75,23 +69,20 @@ def starts(path: Path, table: pd.DataFrame) -> None:
 
 
 def peaks(path: Path, table: pd.DataFrame) -> None:
-    """Eq. 21 as printed and corrected: when the peak is, and what the triangle with it misses."""
-    figure, axes = panels(1, 2, 9.0, 3.2)
-    looks = {"corrected": ("direct", "corrected"), "printed": ("triangle", "as printed")}
-    for panel, column in zip(axes, ("time", "fill_rmse"), strict=True):
-        for formula, (style, label) in looks.items():
-            rows = table[table["formula"] == formula]
-            line(panel, rows["rail"], rows[f"{column}_median"], style, f"Eq. 21 {label}")
-            panel.fill_between(
-                rows["rail"],
-                rows[f"{column}_low"],
-                rows[f"{column}_high"],
-                color=STYLES[style]["color"],
-                alpha=0.2,
-                lw=0,
-            )
-        panel.set(xlabel="gyroscope rail (rad/s)")
-    axes[0].set(ylabel="peak time, off the true one (samples)", yscale="symlog")
-    axes[1].set(ylabel="RMS error in the gap (rad/s)", yscale="log")
-    axes[0].legend(fontsize=8)
+    """Eq. 21 as printed and corrected: how far off its peak is in time, against the gap that it must lie in."""
+    figure, (panel,) = panels(1, 1, 6.5, 3.6)
+    looks = {"corrected": ("direct", "Eq. 21 corrected"), "printed": ("triangle", "Eq. 21 as printed")}
+    for formula, (style, label) in looks.items():
+        rows = table[table["formula"] == formula]
+        line(panel, rows["rail"], rows["off_median"], style, label)
+        panel.fill_between(
+            rows["rail"], rows["off_low"], rows["off_high"], color=STYLES[style]["color"], alpha=0.2, lw=0
+        )
+    rows = table.drop_duplicates("rail")
+    line(panel, rows["rail"], rows["gap_median"] / 2, "unclipped", "half the gap: beyond lies outside of it")
+    panel.set(xlabel="gyroscope rail (rad/s)", ylabel="peak, off the true one (samples)", yscale="log")
+    plain_log(panel.yaxis)
+    panel.yaxis.set_major_locator(LogLocator())
+    panel.set_title("lines: median over the seeds; bands: 5 to 95 %", fontsize=8)
+    panel.legend(fontsize=8)
     save(figure, path)

@@ -11,18 +11,23 @@ import pandas as pd
 from jaxsat.studies.boards import Row
 
 from .drawing import LABELS
-from .trials import METHODS, Settings, settings
+from .trials import METHODS, SWEPT, Settings, settings
 
 # The tables of the paper: the experiment, and the column that its error is in.
 TABLES = {"table1": ("bar", "last"), "table2": ("straight", "last"), "table3": ("planar", "distance")}
 WALKS = ("walk_saturated", "walk_clipped")
+_ERRORS = {
+    "last": "last position (m)",
+    "norm": "position error norm (m²)",
+    "distance": "start-stop distance (m)",
+}
 FIGURES = {
     "errors": "error",
     "path": "path",
     "filled": "the saturated signal, filled",
-    "intervals": "errors and intervals",
+    "intervals": "coordinates of the end within some sd of the truth",
     "descent": "J along the search",
-    "peaks": "peaks",
+    "peaks": "how far off its peaks are",
 }
 
 
@@ -56,7 +61,7 @@ def board(out: Path, done: Mapping[str, Settings]) -> Iterator[Row]:
                 continue
             ratio, rmse = (found[column].to_numpy() for column in ("last_ratio", "rmse_ratio"))
             note = (
-                f"last position, aligned, against motion capture: median of {len(found)} recordings, "
+                f"last position, aligned, against motion capture: median of {len(found)} trials, "
                 f"{ratio.min():.2f} to {ratio.max():.2f}; RMSE, geometric mean {_mean(rmse):.2f}"
             )
             yield Row(
@@ -73,9 +78,12 @@ def board(out: Path, done: Mapping[str, Settings]) -> Iterator[Row]:
             for column, what in (("fill", "filled values"), ("end", "coordinates of the last position")):
                 note = f"share of {what} within 1.96 sd of the truth, {row['seeds']} seeds; a wide interval holds all"
                 yield Row(f"coverage_{column}_{row['method']}", row[column], "1", "higher", 0.95, None, note)
-    seconds = [json.loads((out / name / "env.json").read_text())["seconds"] for name in done]
-    note = f"{len(done)} experiments one after the other, from a warm cache of compiled programs or not"
-    yield Row("paper_minutes", sum(seconds) / 60.0, "min", "lower", 10.0, None, note)
+    took = [json.loads((out / name / "env.json").read_text()) for name in done]
+    cpu = sum(each.get("cpu_seconds", np.nan) for each in took) / 60.0
+    note = f"{len(done)} experiments in several runs that traced, some compiled, anew on shared cores; " + (
+        f"processor time {cpu:.1f} min" if np.isfinite(cpu) else "processor time was not taken of all"
+    )
+    yield Row("paper_minutes", sum(each["seconds"] for each in took) / 60.0, "min", "lower", 10.0, None, note)
 
 
 def _ratios(metric: str, rows: pd.DataFrame, column: str, paper: Mapping[str, float]) -> Iterator[Row]:
@@ -123,36 +131,78 @@ def page(out: Path, done: Mapping[str, Settings]) -> str:
 
 
 def _table(rows: pd.DataFrame, chosen: Settings) -> str:
-    """The table of an experiment for people; sweeps have their figure instead."""
+    """The table of an experiment for people."""
     if "order" in rows or "formula" in rows or "start" in rows or "solver" in rows:
         return _plain(rows)
     if "sweep" in chosen:
-        return ""
+        return _sweep(rows)
+    if "end" in rows:
+        return _coverage(rows)
     if "trial" in rows:
         return _trials(rows)
-    if "paper" not in chosen:
-        return _markdown(rows)
     column = next(iter(chosen["paper"]))
+    sensor, unit = ("gyr", "rad/s") if "gyr" in chosen["rails"] else ("acc", "m/s²")
     cells = []
-    for row in rows.to_dict("records"):
+    for row in rows.set_index("method", drop=False).loc[list(LABELS)[2:]].to_dict("records"):
         method, paper = row["method"], chosen["paper"]
         cell: dict[str, Any] = {"": LABELS[method]}
         for name, values in paper.items():
-            what = {"last": "last position (m)", "norm": "norm", "distance": "start-stop distance (m)"}[name]
+            what = _ERRORS[name]
             cell[f"{what}, paper"] = _number(values.get(method))
             cell[f"{what}, ours"] = _spread(row, name)
         cell["ratio, paper"] = (
             _number(paper[column][method] / paper[column]["standard"]) if method in paper[column] else ""
         )
         cell["ratio, ours"] = _spread(row, f"{column}_ratio")
-        sensor = "gyr" if row.get("fill_rmse_gyr_median", np.nan) > 0 else "acc"
-        cell["filled values, RMS error"] = _number(row[f"fill_rmse_{sensor}_median"])
+        cell[f"filled values, RMS error ({unit})"] = _number(row[f"fill_rmse_{sensor}_median"])
         cells.append(cell)
     found = rows.loc[rows["method"].isin(METHODS)]
     return _markdown(pd.DataFrame(cells)) + (
         f"\nMedians and 5 to 95 % over {int(found['seeds'].iloc[0])} seeds; {found['saturated'].median():g} values "
-        f"saturate; {found['converged'].min():.0%} or more of the searches of each method converged.\n"
+        f"saturate; {_converged(found)}\n"
     )
+
+
+def _converged(rows: pd.DataFrame) -> str:
+    """What share of the searches did, of the worst row."""
+    least = float(np.min(rows["converged"]))
+    if least == 1.0:
+        return "every search converged."
+    return f"at least {least:.1%} of the searches of each method converged."
+
+
+def _sweep(rows: pd.DataFrame) -> str:
+    """Some of its steps; all are in the file."""
+    by = next(column for column in SWEPT if column in rows)
+    what = {"gyr_rail": "gyroscope rail (rad/s)", "gyr_bound": "δ_b (rad/s)"}[by]
+    steps = np.unique(rows[by])
+    cells = []
+    for step in steps[np.linspace(0, len(steps) - 1, min(8, len(steps))).round().astype(int)]:
+        found = {row["method"]: row for row in rows.loc[rows[by] == step].to_dict("records")}
+        cell = {what: _number(step), "saturated values": f"{found['standard']['saturated']:g}"}
+        for method in ("standard", *METHODS):
+            cell[LABELS[method]] = _number(found[method]["last_median"])
+        cells.append(cell)
+    return (
+        f"Last-position error (m), medians over {int(rows['seeds'].iloc[0])} seeds, {len(cells)} of {len(steps)} "
+        f"values:\n\n{_markdown(pd.DataFrame(cells))}\nWhere something saturates, "
+        f"{_converged(rows.loc[rows['saturated'] > 0])}\n"
+    )
+
+
+def _coverage(rows: pd.DataFrame) -> str:
+    cells = [
+        {
+            "": LABELS[row["method"]],
+            "seeds": row["seeds"],
+            "filled values within 1.96 sd": f"{row['fill']:.0%}",
+            "coordinates of the last position within 1.96 sd": f"{row['end']:.0%}",
+            "last-position error (m), median": _number(row["error_median"]),
+            "its sd (m), median": _number(row["sd_median"]),
+        }
+        for row in rows.to_dict("records")
+    ]
+    return _markdown(pd.DataFrame(cells))
 
 
 def _trials(rows: pd.DataFrame) -> str:

@@ -34,7 +34,7 @@ def coverage(chosen: Settings, out: Path) -> None:
 
     From `estimate`, recording by recording: a sweep gives no covariances.
     """
-    rows = []
+    rows, ends = [], {method: [] for method in chosen["methods"]}
     for method in chosen["methods"]:
         for seed in range(chosen["seeds"]):
             recording, truth, config = clipped(chosen, seed)
@@ -44,6 +44,7 @@ def coverage(chosen: Settings, out: Path) -> None:
             away = (found.filled - truth.signal)[lost] / found.signal_sd[lost]
             sd = np.sqrt(np.diagonal(found.trajectory.covariance[-1])[3:6])
             error = (found.trajectory.position - truth.position)[-1]
+            ends[method] += (np.abs(error) / sd).tolist()
             rows.append(
                 {
                     "method": method,
@@ -64,7 +65,7 @@ def coverage(chosen: Settings, out: Path) -> None:
         sd_median=("sd", "median"),
     )
     held.reset_index().to_csv(out / "table.csv", index=False, float_format="%.4g")
-    drawing.coverage(out / "intervals", table)
+    drawing.coverage(out / "intervals", ends)
 
 
 class Problem(eqx.Module):
@@ -273,6 +274,8 @@ def eq21(chosen: Settings, out: Path) -> None:
             formula=name,
             usable=np.asarray(usable),
             time=np.asarray(time) - true,
+            off=np.abs(np.asarray(time) - true),
+            gap=gap.sum(axis=1),
             height=np.asarray(height),
             fill_rmse=np.sqrt((missed**2).sum(axis=1) / gap.sum(axis=1)),
             impulse=missed.sum(axis=1) / chosen["rate"],
@@ -281,7 +284,7 @@ def eq21(chosen: Settings, out: Path) -> None:
     groups = pd.concat(rows).groupby(["rail", "formula"], sort=False)
     columns = {
         f"{column}_{label}": groups[column].quantile(q)
-        for column in ("time", "height", "fill_rmse", "impulse")
+        for column in ("time", "off", "gap", "height", "fill_rmse", "impulse")
         for label, q in zip(("low", "median", "high"), QUANTILES, strict=True)
     }
     table = pd.DataFrame({"usable": groups["usable"].mean(), **columns}).reset_index()

@@ -30,8 +30,11 @@ def table(chosen: Settings, out: Path) -> None:
     values = np.concatenate([values_of(chosen, each, [bound]) for each in (rails, {})])
     rows = summary(beside_unclipped(score(trials, values, chosen["chunk"])), [], COLUMNS)
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
-    column, unit = ("distance", "mm") if chosen["motion"]["kind"] == "planar" else ("last", "m")
-    drawing.ratios(out / "errors", rows, column, chosen["paper"][column], unit)
+    if chosen["motion"]["kind"] == "planar":
+        column, what, unit = "distance", "error of the start-stop distance", "mm"
+    else:
+        column, what, unit = "last", "last-position error", "m"
+    drawing.errors(out / "errors", rows, column, chosen["paper"][column], what, unit)
     figures(chosen, out)
 
 

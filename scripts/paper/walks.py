@@ -33,12 +33,11 @@ def simulated(chosen: Settings, out: Path) -> None:
     values = np.concatenate([values_of(chosen, each, [bound]) for each in (rails, {})])
     rows = summary(beside_unclipped(score(trials, values, chosen["chunk"])), [], COLUMNS)
     rows.to_csv(out / "table.csv", index=False, float_format="%.6g")
-    drawing.ratios(out / "errors", rows, "last", chosen["paper"]["last"], "m")
+    drawing.errors(out / "errors", rows, "last", chosen["paper"]["last"], "last-position error", "m")
     recording, truth, config = clipped(chosen, 0)
     found = estimates(recording, config, SHOWN)
-    drawing.plan(
-        out / "path", {"truth": truth.position, **{m: e.trajectory.position for m, e in found.items()}}
-    )
+    tracks = {"truth": truth.position, **{m: e.trajectory.position for m, e in found.items()}}
+    drawing.travel(out / "path", truth.time, tracks)
 
 
 def saturated(chosen: Settings, out: Path, data: Path) -> None:
