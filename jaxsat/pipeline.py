@@ -31,7 +31,7 @@ LATEST_FIRST_REST = 1.0
 # A gyroscope offset is taken from a first rest of at least this length; a shorter one tells less than it costs.
 SHORTEST_OFFSET_REST = 1.0
 # sd of the unknown velocity of a sensor that does not start at rest (m/s), and of its tilt (rad), however long it
-# moves before its first rest: the PI controller knows it no worse on the trials of results/orientation.
+# moves before its first rest: a round number above the PI controller's inclination errors in results/orientation.
 MOVING_START_SD = 3.0
 MOVING_START_TILT_SD = 0.05
 # sd of the gyroscope offset that is left while a rate is integrated back from the first rest (rad/s).
