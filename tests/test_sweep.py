@@ -76,7 +76,7 @@ def row(table: pd.DataFrame, trial: str, method: str, rail: float) -> pd.Series:
 
 
 @pytest.mark.parametrize("trial", [0, 2])
-@pytest.mark.parametrize("method", ["standard", "direct", "map"])
+@pytest.mark.parametrize("method", ["standard", "direct", pytest.param("map", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rail", RAILS)
 def test_an_element_is_the_estimate_of_the_clipped_recording(table, mapped, trials, trial, method, rail):
     """`whole` at infinity does not saturate, `clipped` by itself; at the rail both are clipped in software."""

@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.dense import inverse_positive, solve_positive
 
-# Terms that predict the second difference. Of 1, 2, 4 and 6 terms four filled the long gaps of the PyShoe walks of the
-# list `clip` best (clipped at 250 °/s) and two the short ones (350 °/s), compared before `WIDTH` was per gap.
+# Terms that predict the second difference. Of 1, 2, 4 and 6 terms four filled the long gaps of the PyShoe walks of
+# the list `clip` best (clipped at 250 °/s) and two the short ones (350 °/s), compared before `WIDTH` was per gap.
 ORDER = 4
 # An autoregression is learned from samples within so many seconds of a gap of its channel: movement that is as
 # fast as what was lost, not the average of rest and movement.
