@@ -25,7 +25,7 @@ import numpy as np
 from peers import shortest
 from peers.paper_way import bar_problem, dense_objective, paper_way
 from peers.smoothers import cuthbert_smoother, dynamax_smoother, linear_model, walking_trials
-from problems import OPTIONS, Batch, bars, run_direct, strapdown_seconds, walk, with_rests
+from problems import OPTIONS, Batch, bars, direct, run_direct, strapdown_seconds, walk, with_rests
 
 from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.smoother import smooth_about
