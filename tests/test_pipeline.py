@@ -1,5 +1,7 @@
 """The whole way on simulated recordings: the paper's ratios, no harm without saturation, both orders of segments."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -71,6 +73,19 @@ def test_filled_signal_lies_beyond_the_rail_and_near_the_truth(method):
     error = np.sqrt(np.mean((found.filled - truth.signal)[where] ** 2))
     ignored = np.sqrt(np.mean((recording.signal - truth.signal)[where] ** 2))
     assert error < 0.1 * ignored
+
+
+def test_the_path_of_map_takes_filled_rates_as_measured_and_its_covariance_does_not():
+    recording, _ = bar(3, gyr_rail=7.5)
+    found = estimate(recording, load_config(None, method="map", **BAR))
+    given = replace(recording.with_signal(found.filled), clipped=None)
+    plain = estimate(given, load_config(None, **{**BAR, "rails.gyr": "none", "method": "standard"}))
+    assert not plain.saturated.any() and found.saturated.any()
+    np.testing.assert_allclose(found.trajectory.position, plain.trajectory.position, atol=1e-9)
+    np.testing.assert_allclose(found.trajectory.q_nb, plain.trajectory.q_nb, atol=1e-9)
+    sure, unsure = (np.diagonal(x.trajectory.covariance, axis1=1, axis2=2) for x in (plain, found))
+    # Linearised about paths that differ by a little.
+    assert (unsure >= sure * (1 - 1e-4)).all() and (unsure.max(axis=0) > 1.01 * sure.max(axis=0)).any()
 
 
 def test_map_leaves_at_most_a_tenth_of_the_error_on_the_bar():

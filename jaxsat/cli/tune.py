@@ -69,6 +69,7 @@ def tune_command(
         read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc) for path in paths
     ]
     use_compilation_cache()
+    from jaxsat.studies.boards import write_whole
     from jaxsat.studies.metrics import load_truth
     from jaxsat.studies.tuning import noise_trial, tune_noise
 
@@ -83,7 +84,7 @@ def tune_command(
     text = tuning_text(noise, loss, truth, [path.name for path in paths])
     found = settings.model_copy(update={"noise": tuned.noise})
     head = "".join(f"# {line}\n" for line in text.splitlines())
-    _write(out, f"{head}\n{config_toml(found)}")
+    write_whole(out, f"{head}\n{config_toml(found)}")
     saturated = {one.name: int((t.trial.sign != 0).sum()) for one, t in zip(measured, trials, strict=True)}
     warnings = [
         f"{name}: {count} saturated values count as measured; learn from recordings that do not saturate."
@@ -120,10 +121,3 @@ def _listed(file: Path, name: str) -> list[Path]:
             )
         found += fitting
     return found
-
-
-def _write(path: Path, text: str) -> None:
-    """Under a temporary name first: a file with the final name is always whole."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, "utf-8")
-    os.replace(partial, path)

@@ -67,9 +67,9 @@ def write_board(path: Path, rows: Iterable[Row], configuration: Mapping[str, Any
         raise InputError(f"{path}: the metric '{twice[0]}' comes twice; name each row differently.")
     environment = {**machine(), "configuration": dict(configuration)}
     path.parent.mkdir(parents=True, exist_ok=True)
-    _write(_environment_path(path), _as_json(environment))
-    _write(path.with_suffix(".md"), _as_markdown(rows, environment))
-    _write(path, _as_json([asdict(row) for row in rows]))
+    write_whole(_environment_path(path), _as_json(environment))
+    write_whole(path.with_suffix(".md"), _as_markdown(rows, environment))
+    write_whole(path, _as_json([asdict(row) for row in rows]))
 
 
 def read_board(path: Path) -> list[Row]:
@@ -191,7 +191,7 @@ def _number(value: float | int | None) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
-def _write(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
     """Under a temporary name first: a file with the final name is always whole."""
     partial = path.with_name(f".{path.name}.partial")
     partial.write_text(text, "utf-8")
