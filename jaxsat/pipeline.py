@@ -187,7 +187,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     n = len(recording)
 
     def sampled(f):
-        return f.signal, f.variance, f.slack, f.sd, f.gap_sd, f.identified, f.at_bound
+        return f.signal, f.variance, f.slack, f.sd, f.gap_sd, f.identified, f.at_bound, f.inflated
 
     fills = eqx.tree_at(sampled, fills, [x[:n] for x in sampled(fills)])
     if floor is not None:

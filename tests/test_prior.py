@@ -14,7 +14,7 @@ from jaxsat.saturation.prior import (
     WIDTH,
     Known,
     SignalPrior,
-    hidden_excess,
+    hidden_peaks,
     learn,
     of_values,
     spread,
@@ -105,7 +105,8 @@ OF_VALUES = jax.jit(of_values)
 @pytest.fixture(scope="module")
 def prior() -> SignalPrior:
     kernel = np.stack([kernel_of(filter_of(PHI), variance) for variance in SIGMA**2])
-    return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2), jnp.ones((6, len(NODES))))
+    nodes = 6, len(NODES)
+    return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2), jnp.ones(nodes), jnp.zeros(nodes, bool))
 
 
 def known(prior, signal=SHORT, sample=SAMPLE, channel=CHANNEL, sign=SIGN) -> Known:
@@ -167,11 +168,11 @@ def test_the_mode_of_a_gap_is_the_most_probable_signal(prior):
     assert eqx.tree_equal(found, known(prior))
 
 
-HIDDEN = jax.jit(hidden_excess)
+HIDDEN = jax.jit(hidden_peaks)
 
 
-def hidden_errors(x, ok, rail, kernel, length) -> list[tuple[float, float, float]]:
-    """Squared error, variance and weight of each peak of so many samples, written out."""
+def hidden_errors(x, ok, rail, kernel, length) -> list[tuple[float, float, float, float]]:
+    """Squared errors if filled and if cut off, variance and weight of each peak of so many samples, written out."""
     reach, found = len(kernel) - 1, []
     lag = np.abs(np.subtract.outer(np.arange(len(x)), np.arange(len(x))))
     band = np.where(lag <= reach, kernel[np.minimum(lag, reach)], 0.0)
@@ -187,7 +188,8 @@ def hidden_errors(x, ok, rail, kernel, length) -> list[tuple[float, float, float
             y[inside] = level
             own = band[np.ix_(inside, inside)] + np.eye(length) / ((WIDTH * rail) ** 2 * length)
             filled = np.linalg.solve(own, -(band @ y)[inside]).sum()
-            found.append(((max(filled, 0.0) - lost) ** 2, np.linalg.inv(own).sum(), (top / rail) ** 4))
+            variance, weight = np.linalg.inv(own).sum(), (top / rail) ** 4
+            found.append(((max(filled, 0.0) - lost) ** 2, lost**2, variance, weight))
     return found
 
 
@@ -199,12 +201,13 @@ def test_hidden_peaks_are_filled_one_by_one(walk):
     kernel, rail = kernel_of(filter_of(PHI), 0.8), 6.0
     found = HIDDEN(*map(jnp.asarray, (x, ok)), jnp.asarray(rail), jnp.asarray(kernel))
     seen = 0
-    for length, ratio in zip(NODES, found, strict=True):
-        peaks = np.array(hidden_errors(x, ok, rail, kernel, length)).reshape(-1, 3)
+    for length, excess, harmful in zip(NODES, *found, strict=True):
+        peaks = np.array(hidden_errors(x, ok, rail, kernel, length)).reshape(-1, 4)
         seen += len(peaks)
-        error = np.sum(peaks[:, 0] / peaks[:, 1] * peaks[:, 2]) + CREDIT
-        assert ratio == pytest.approx(error / (peaks[:, 2].sum() + CREDIT), rel=1e-8)
-    assert seen > 20
+        filled, cut = (np.sum(peaks[:, k] / peaks[:, 2] * peaks[:, 3]) + CREDIT for k in (0, 1))
+        assert excess == pytest.approx(filled / (peaks[:, 3].sum() + CREDIT), rel=1e-8)
+        assert harmful == (filled - CREDIT > cut)
+    assert seen > 20 and 0 < np.sum(found[1]) < len(NODES)
 
 
 def test_a_prior_that_is_right_is_believed_and_one_that_is_surprised_is_not():
@@ -221,15 +224,23 @@ def test_a_prior_that_is_right_is_believed_and_one_that_is_surprised_is_not():
     assert (learned(struck, sign).excess[:, one] > 1.5).all()
 
 
-def test_what_was_far_off_is_believed_less(prior):
-    """A gap whose like was off by twice the sd has a quarter of the precision, and the same mode but for the pull."""
+def test_what_was_far_off_is_believed_less_but_filled_alike(prior):
+    """A channel whose hidden peaks were off by twice the sd has four times the variance, and the same mode."""
     found = known(prior)
-    excess = prior.excess.at[1].set(4.0)
-    doubted = known(SignalPrior(prior.kernel, prior.innovation, excess))
-    real = SIGN != 0
-    rail = np.abs(SHORT[SAMPLE, CHANNEL])
-    pull = np.diag(np.where(real, 1.0 / ((WIDTH * rail) ** 2 * np.maximum(LENGTH, 1.0)), 1.0))
-    scale = np.where(CHANNEL == 1, 0.5, 1.0)
-    expected = (np.asarray(found.precision) - pull) * np.outer(scale, scale) + pull
-    np.testing.assert_allclose(doubted.precision, expected, atol=1e-12 * np.abs(expected).max())
-    np.testing.assert_allclose(doubted.slope, found.slope * scale**2, rtol=1e-12)
+    doubted = known(eqx.tree_at(lambda p: p.excess, prior, prior.excess.at[1].set(4.0)))
+    np.testing.assert_array_equal(doubted.precision, found.precision)
+    np.testing.assert_array_equal(doubted.slope, found.slope)
+    sd = np.where((CHANNEL == 1) & (SIGN != 0), 2.0, 1.0)
+    np.testing.assert_allclose(
+        doubted.covariance(), np.outer(sd, sd) * np.linalg.inv(found.precision), atol=1e-10
+    )
+
+
+def test_what_would_be_worse_filled_is_marked_by_channel_and_length(prior):
+    """What such a value may have lost is its square in the mean: variance and mean of the prior."""
+    harmful = prior.harmful.at[1, NODES.index(1)].set(True)
+    found = known(eqx.tree_at(lambda p: p.harmful, prior, harmful))
+    np.testing.assert_array_equal(found.harmful, (LENGTH == 1) & (CHANNEL == 1) & (SIGN != 0))
+    mean = np.linalg.solve(found.precision, -np.asarray(found.slope))
+    variance = np.diagonal(np.linalg.inv(found.precision))
+    np.testing.assert_allclose(spread(found), variance + np.where(found.harmful, mean**2, 0.0), rtol=1e-9)

@@ -49,6 +49,7 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
             "largest_residual": float(fills.residual[busy].max(initial=0.0)),
         },
         "at_bound": dict(zip(CHANNELS, fills.at_bound.sum(axis=0).tolist(), strict=True)),
+        "inflated": dict(zip(CHANNELS, fills.inflated.sum(axis=0).tolist(), strict=True)),
         "cost": {"before": float(estimate.cost_standard), "after": float(estimate.cost)},
         "gravity": float(estimate.gravity),
         "gyr_offset": estimate.gyr_offset.tolist(),

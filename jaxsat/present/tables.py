@@ -64,8 +64,10 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
 
     Columns: `channel`, `start` and `end` (s, [start, end)), `rail` (the limit, signed; where the device flagged
     the gap and no limit is known, the extreme measured value), `peak` (extreme filled value, signed), `impulse`
-    (time integral of what was added, rad or m/s), `status` (how the search of the gap's segment ended:
-    `converged`, `max_iterations`, `no_arrival` where no rest follows, or `ignored` by method standard). Method map
+    (time integral of what was added, rad or m/s), `status` (how the search of the gap's segment ended: `converged`,
+    `max_iterations`, `no_arrival` where no rest follows, `ignored` by method standard, or `inflated` where map left
+    the values as they are and took them as noisier, because unsaturated peaks of the channel and about that length
+    were further off when hidden and filled than when cut off). Method map
     says how well a gap is known: `peak_sd` of the extreme value, `impulse_sd`, and `identified`, the share of the
     impulse's variance under the signal prior that the rests removed (0: the prior alone decides, 1: the rests do).
     The other methods find one best signal, not a distribution, and leave these empty.
@@ -78,6 +80,9 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
     fills = estimate.fills
     first = (gaps.start, gaps.channel)
     known = np.isfinite(fills.identified[first])
+    status = np.where(
+        fills.inflated[first], "inflated", _status_words(estimate)[_segment_at(estimate, gaps.start)]
+    )
     tops = [i + int(np.argmax(np.abs(estimate.filled[i:j, c]))) for c, i, j in spans]
 
     def where_known(x) -> pd.Series:
@@ -94,7 +99,7 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
             "impulse": np.array([added[i:j, c].sum() * period for c, i, j in spans], float),
             "impulse_sd": where_known(fills.gap_sd[first] * period),
             "identified": where_known(fills.identified[first]),
-            "status": pd.array(_status_words(estimate)[_segment_at(estimate, gaps.start)], dtype="string"),
+            "status": pd.array(status, dtype="string"),
         }
     )
     return table.sort_values(["start", "channel"], ignore_index=True)

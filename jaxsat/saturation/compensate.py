@@ -55,6 +55,8 @@ class Fills(eqx.Module):
     """Share of the variance of that sum that the rests removed; NaN where the method does not say."""
     at_bound: Bool[np.ndarray, "N 6"]
     """Values where the bound decided, not the data."""
+    inflated: Bool[np.ndarray, "N 6"]
+    """Values that `map` left as they are but for their noise (`SegmentFill.inflated`)."""
     status: Int[np.ndarray, "S"]
     cost_before: Float[np.ndarray, "S"]
     """f(0), with the departure of the last sweep."""
@@ -79,6 +81,7 @@ class Fills(eqx.Module):
             gap_sd=np.full(shape, np.nan),
             identified=np.full(shape, np.nan),
             at_bound=np.zeros(shape, bool),
+            inflated=np.zeros(shape, bool),
             status=np.full(count, int(Status.NOTHING_TO_DO)),
             cost_before=zeros,
             cost_after=zeros.copy(),
@@ -102,6 +105,7 @@ class Fills(eqx.Module):
         self.slack[sample, channel] = found.slack[real]
         self.sd[sample, channel] = np.sqrt(found.variance[real])
         self.at_bound[sample, channel] = found.at_bound[real]
+        self.inflated[sample, channel] = found.inflated[real]
         self.status[segments] = found.solution.status
         self.cost_before[segments], self.cost_after[segments] = found.cost_before, found.solution.value
         self.residual[segments], self.iterations[segments] = (

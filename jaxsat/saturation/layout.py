@@ -75,7 +75,9 @@ def bucket(count: int, smallest: int, factor: int = 4) -> int:
 
 def padded_sizes(samples: int, values: int, factor: int = 4) -> Sizes:
     """For segments of at most so many samples and saturated values; a smaller factor wastes and shares less."""
-    return Sizes(bucket(samples, 256, factor), bucket(values, 16, factor))
+    padded = bucket(values, 16, factor)
+    # `map` factorises matrices of that size: where they are large, what padding wastes counts.
+    return Sizes(bucket(samples, 256, factor), padded if padded <= 64 else bucket(values, 64, 2))
 
 
 def pad(x: np.ndarray, size: int) -> np.ndarray:

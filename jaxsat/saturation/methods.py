@@ -36,14 +36,15 @@ class Search(eqx.Module):
 def search_space(method: Compensation, segment: Segment, free_peak_time: bool = False) -> Search:
     """Method 1 (`direct`) searches every δ from 0; method 2 the height of each gap, from half of its range.
 
-    `map` searches every δ from where the signal prior alone puts it.
+    `map` searches every δ from where the signal prior alone puts it, but for those of gaps that are not to be filled.
     free_peak_time: method 2 also searches where in the gap the peak lies, instead of fixing it by Eq. 21.
     """
     if method == "map":
         assert segment.known is not None, "the signal prior was gathered"
         nothing = jnp.zeros_like(segment.bound)
-        start = dense_box_step(segment.known.slope, segment.known.precision, nothing, segment.bound)
-        return Search(lambda delta: delta, segment.bound, start)
+        upper = jnp.where(segment.known.harmful, 0.0, segment.bound)
+        start = dense_box_step(segment.known.slope, segment.known.precision, nothing, upper)
+        return Search(lambda delta: delta, upper, start)
     if method == "direct":
         return Search(lambda delta: delta, segment.bound, jnp.zeros_like(segment.bound))
     edges = segment.edges
@@ -87,6 +88,8 @@ class SegmentFill(eqx.Module):
     """What to add to the noise of each filled value for the path that goes with it."""
     at_bound: Bool[Array, "m"]
     """δ ends at its bound: the bound decided, not the data."""
+    inflated: Bool[Array, "m"]
+    """Not filled, because hidden peaks of its like were worse filled; its noise says what it may have lost."""
 
 
 class Options(eqx.Module):
@@ -161,7 +164,7 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     # δ of `map` is the mode together with the path, which takes it as measured: a smoother that is free to turn what
     # is filled once more lets it account for what other axes did. Accelerometers saturate in impacts, which no smooth
     # prior describes; there the path is better off with some freedom.
-    slack = variance if known is None else jnp.where(segment.channel < 3, 0.0, variance)
+    slack = variance if known is None else jnp.where((segment.channel < 3) & ~known.harmful, 0.0, variance)
     at_bound = real & (delta >= segment.bound * (1.0 - 1e-9))
     return SegmentFill(
         delta=delta,
@@ -170,4 +173,5 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
         variance=variance,
         slack=slack,
         at_bound=at_bound,
+        inflated=jnp.zeros_like(real) if known is None else known.harmful,
     )

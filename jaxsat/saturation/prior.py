@@ -42,6 +42,8 @@ class SignalPrior(eqx.Module):
     """σ², the variance of a sample given all before it."""
     excess: Float[Array, "*six L"]
     """By how much the squares of the errors of hidden peaks exceed what the kernel says, by length (`NODES`)."""
+    harmful: Bool[Array, "*six L"]
+    """Whether hidden peaks of that length were further off filled than cut off."""
 
 
 def learn(
@@ -87,14 +89,14 @@ def _learn_channel(x, saturated, ok, reach) -> SignalPrior:
     size = len(predictor)
     kernel = jnp.stack([jnp.sum(predictor[: size - k] * predictor[k:]) for k in range(size)])
     kernel = kernel / innovation
-    excess = hidden_excess(x, ok, jnp.max(jnp.where(saturated, jnp.abs(x), 0.0)), kernel)
-    return SignalPrior(kernel=kernel, innovation=innovation, excess=excess)
+    excess, harmful = hidden_peaks(x, ok, jnp.max(jnp.where(saturated, jnp.abs(x), 0.0)), kernel)
+    return SignalPrior(kernel, innovation, excess, harmful)
 
 
-def hidden_excess(
+def hidden_peaks(
     x: Float[Array, "N"], ok: Bool[Array, "N"], rail: Float[Array, ""], kernel: Float[Array, "K"]
-) -> Float[Array, "L"]:
-    """Mean of the squared errors of filled peaks over the prior's variance: masked cross-validation on a channel.
+) -> tuple[Float[Array, "L"], Bool[Array, "L"]]:
+    """Masked cross-validation on a channel: `SignalPrior.excess` and `SignalPrior.harmful`.
 
     Peaks that did not saturate (`ok`) are cut off at the higher of the values beside them, and what they lost in all
     is asked of the prior; those near the rail count most.
@@ -124,20 +126,32 @@ def hidden_excess(
             left, within, right = jnp.split(weights, [reach, reach + length])
             sides = sum(left[k] * at(x, k - reach) + right[k] * at(x, length + k) for k in range(reach))
             filled = jnp.maximum(-sides - jnp.sum(within) * level, 0.0)
-            square = (filled - (total - length * level)) ** 2 / jnp.sum(toll)
-            weight = jnp.where(peak, (top / rail) ** 4, 0.0)
-            found.append((jnp.sum(weight * square), jnp.sum(weight)))
+            lost = total - length * level
+            weight = jnp.where(peak, (top / rail) ** 4 / jnp.sum(toll), 0.0)
+            found.append([jnp.sum(weight * each) for each in ((filled - lost) ** 2, lost**2, jnp.sum(toll))])
         return jnp.array(found)
 
-    squares, weights = jnp.sum(jax.vmap(peaks_up)(jnp.stack([x, -x])), axis=0).T
-    return (squares + CREDIT) / (weights + CREDIT)
+    filled, cut, weights = jnp.sum(jax.vmap(peaks_up)(jnp.stack([x, -x])), axis=0).T
+    return (filled + CREDIT) / (weights + CREDIT), filled > cut + CREDIT
 
 
 class Known(eqx.Module):
     """The prior of the δ of one segment: ½ δᵀΩδ + bᵀδ."""
 
     precision: Float[Array, "m m"]
+    """Ω."""
     slope: Float[Array, "m"]
+    """b."""
+    excess: Float[Array, "m"]
+    """`SignalPrior.excess` of each value: a factor of its variance wherever it is said how sure a fill is. The mode
+    of δ does without: it was no nearer to the truth with it, and worse where short gaps were believed less."""
+    harmful: Bool[Array, "m"]
+    """Not to be filled."""
+
+    def covariance(self) -> Float[Array, "m m"]:
+        """Of δ before rests are heard, as far off as hidden peaks were."""
+        sd = jnp.sqrt(self.excess)
+        return inverse_positive(self.precision) * sd[:, None] * sd[None]
 
 
 def of_values(
@@ -164,22 +178,21 @@ def of_values(
     # Values of a gap go together: what is known of their mean must not be counted once for each.
     pull = 1.0 / ((WIDTH * rail) ** 2 * jnp.maximum(length, 1.0))
     real = sign != 0.0
-    # What is far off with hidden peaks of that length is believed less.
+    precision = jnp.where(same & real[:, None] & real[None], values * sign[:, None] * sign[None], 0.0)
+    precision = precision + jnp.diag(jnp.where(real, pull, 1.0))
+    slope = jnp.where(real, sign * jnp.sum(weights * window, axis=1), 0.0)
+    # What hidden peaks of about that length say.
     place = jnp.clip(jnp.log2(jnp.maximum(length, 1.0)), 0.0, len(NODES) - 1.0)
     nearness = jnp.maximum(1.0 - jnp.abs(place[:, None] - jnp.arange(float(len(NODES)))[None]), 0.0)
-    # In a loop: else XLA computes it again for each pair of values.
-    doubt = jax.lax.map(lambda pair: pair[0] @ pair[1], (nearness, prior.excess[channel]))
-    scale = sign / jnp.sqrt(doubt)
-    precision = jnp.where(same & real[:, None] & real[None], values * scale[:, None] * scale[None], 0.0)
-    precision = precision + jnp.diag(jnp.where(real, pull, 1.0))
-    slope = jnp.sum(weights * window, axis=1)
-    return Known(precision, jnp.where(real, sign * slope / doubt, 0.0))
+    excess = jnp.where(real, jnp.sum(nearness * prior.excess[channel], axis=1), 1.0)
+    return Known(precision, slope, excess, real & prior.harmful[channel, jnp.round(place).astype(int)])
 
 
 def spread(known: Known) -> Float[Array, "m"]:
-    """Variance of each δ under the prior alone; zero for padded ones is up to the caller.
+    """Variance of each δ before rests are heard, about what it is set to; zero for padded ones is up to the caller.
 
     A smoother takes values as independent, though errors within a gap go together. Letting each stand for its whole
     gap (row sums of the covariance) was worse: rests have told most of that sum already.
     """
-    return jnp.diagonal(inverse_positive(known.precision))
+    mean = -solve_positive(known.precision, known.slope)
+    return jnp.diagonal(known.covariance()) + jnp.where(known.harmful, mean**2, 0.0)

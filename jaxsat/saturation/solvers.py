@@ -143,9 +143,10 @@ def _solution(x, value, error, count, stalled, tolerance) -> Solution:
     return Solution(x=x, value=value, residual=error, iterations=count, status=status)
 
 
-# Damping, relative to a scaled diagonal of 1: where it starts, the least there is, and where a search gives up.
-# In directions that the data do not see, the rounding of the gradient over the damping is a step: with the least at
-# 1e-6 it moved filled values by 1e-4 rad/s, with 1e-2 by 1e-9, for the same number of steps.
+# Damping, relative to a scaled diagonal of 1: where it starts, the least there is (or the tolerance where that is
+# less: a direction that is damped by more than its curvature settles slowly), and where a search gives up. In
+# directions that the data do not see, the rounding of the gradient over the damping is a step: with the least at 1e-6
+# it moved filled values by 1e-4 rad/s, with 1e-2 by 1e-9, for the same number of steps.
 _DAMPING = (1.0, 1e-2, 1e6)
 
 
@@ -158,6 +159,7 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
     """
     u, low, high = box.scaled()
     first, least, most = _DAMPING
+    least = jnp.minimum(least, box.tolerance)
     known = None if box.precision is None else box.precision * box.scale[:, None] * box.scale[None]
     if known is not None:
         # The prior tells apart what the data do not, so a full step may be tried at once.

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from jaxsat.inertial.dense import inverse_positive, solve_positive
+from jaxsat.inertial.dense import solve_positive
+from jaxsat.saturation.prior import spread
 from jaxsat.saturation.segment import Segment, condense, value_gradient_root
 
 # A cut-off further than so many sd into the tail: what is left there behaves as at this one.
@@ -34,7 +35,7 @@ def uncertainty(segment: Segment, delta: Float[Array, "m"], gravity: Float[Array
     assert known is not None, "the signal prior was gathered"
     _, slope, columns = value_gradient_root(delta, condense(segment), gravity)
     slope = slope + known.slope + known.precision @ delta
-    before = inverse_positive(known.precision)
+    before = known.covariance()
     A = jnp.stack(columns, axis=1)
     seen = before @ A
     inner = jnp.eye(A.shape[1]) + A.T @ seen
@@ -48,8 +49,9 @@ def uncertainty(segment: Segment, delta: Float[Array, "m"], gravity: Float[Array
     gap_sd = jnp.sqrt(jnp.maximum(gap_after, 0.0))[segment.gap]
     # Where a bound holds δ, the Gaussian's own centre lies beyond it.
     centre, sd = delta - after @ slope, jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
+    sd = jnp.where(known.harmful, jnp.sqrt(spread(known)), truncated_sd(centre, sd, segment.bound))
     return Uncertainty(
-        sd=jnp.where(real, truncated_sd(centre, sd, segment.bound), 0.0),
+        sd=jnp.where(real, sd, 0.0),
         gap_sd=jnp.where(real, gap_sd, 0.0),
         identified=jnp.where(real, share[segment.gap], 0.0),
     )
