@@ -18,7 +18,13 @@ from jaxsat.saturation.segment import condense, value_gradient_root
 from jaxsat.saturation.uncertainty import truncated_sd, uncertainty
 
 COLUMNS = jax.jit(value_gradient_root)
-JUDGE = jax.jit(lambda segment, delta: uncertainty(segment, delta, problems.GRAVITY))
+
+
+@jax.jit
+def judge(segment, delta):
+    known = segment.known
+    _, slope, columns = value_gradient_root(delta, condense(segment), problems.GRAVITY)
+    return uncertainty(segment, delta, slope + known.slope + known.precision @ delta, columns)
 
 
 def known_segment(scale: float):
@@ -41,7 +47,7 @@ def test_sd_of_a_truncated_gaussian_is_that_of_scipy():
 
 def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
     segment = known_segment(1e-2)
-    found = JUDGE(segment, DELTA)
+    found = judge(segment, DELTA)
     # A is compared with derivatives of the strapdown in test_segment.
     _, _, columns = COLUMNS(DELTA, condense(segment), problems.GRAVITY)
     A = np.stack(columns, axis=1)[:6]
@@ -57,7 +63,7 @@ def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
 
 def test_without_a_rest_the_prior_decides():
     segment = eqx.tree_at(lambda s: s.arrival, known_segment(1.0), jnp.zeros((10, 10)))
-    found = JUDGE(segment, DELTA)
+    found = judge(segment, DELTA)
     np.testing.assert_allclose(found.identified, 0.0, atol=1e-12)
     prior = np.linalg.inv(np.asarray(segment.known.precision))
     np.testing.assert_allclose(found.gap_sd[0], np.sqrt(prior[:2, :2].sum()), rtol=1e-9)

@@ -27,7 +27,6 @@ from jaxsat.saturation.layout import (
 from jaxsat.saturation.methods import Options, SegmentFill, solve_segment
 from jaxsat.saturation.prior import SignalPrior, learn
 from jaxsat.saturation.solvers import Status
-from jaxsat.saturation.uncertainty import Uncertainty, uncertainty
 from jaxsat.signals.rests import Segments
 
 Progress = Callable[[int, int], None]
@@ -106,19 +105,15 @@ class Fills(eqx.Module):
         self.sd[sample, channel] = np.sqrt(found.variance[real])
         self.at_bound[sample, channel] = found.at_bound[real]
         self.inflated[sample, channel] = found.inflated[real]
+        if (known := found.uncertainty) is not None:
+            self.sd[sample, channel], self.gap_sd[sample, channel] = known.sd[real], known.gap_sd[real]
+            self.identified[sample, channel] = known.identified[real]
         self.status[segments] = found.solution.status
         self.cost_before[segments], self.cost_after[segments] = found.cost_before, found.solution.value
         self.residual[segments], self.iterations[segments] = (
             found.solution.residual,
             found.solution.iterations,
         )
-
-    def record_uncertainty(self, found: Uncertainty, values: Values) -> None:
-        found, values = jax.tree.map(np.asarray, (found, values))
-        real = values.sample < len(self.signal)
-        at = values.sample[real], values.channel[real]
-        self.sd[at], self.gap_sd[at] = found.sd[real], found.gap_sd[real]
-        self.identified[at] = found.identified[real]
 
 
 def filter_trial(
@@ -156,26 +151,6 @@ def solve_segments(
     return jax.vmap(solve)(states, covariances, table, departure, arrival)
 
 
-def judge_segments(
-    trial: Trial,
-    states: NavState,
-    covariances: Float[Arrays, "L s s"],
-    table: Float[Arrays, "L 10 10"],
-    departure: Int[Arrays, "L"],
-    arrival: Int[Arrays, "L"],
-    prior: SignalPrior,
-    sizes: Sizes,
-    delta: Float[Arrays, "L m"],
-) -> tuple[Uncertainty, Values]:
-    """How well what `map` found for them is known; the arguments of `solve_segments`, and its δ."""
-
-    def judge(state, covariance, table, departure, arrival, delta):
-        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
-        return uncertainty(segment, delta, jnp.asarray(trial.gravity)), values
-
-    return jax.vmap(judge)(states, covariances, table, departure, arrival, delta)
-
-
 def signal_prior(trial: Trial) -> SignalPrior:
     """What the unsaturated samples of a recording say of its saturated ones."""
     moving = ~jnp.asarray(trial.rows.rest)
@@ -200,7 +175,6 @@ def trial_biases(
 _bias = eqx.filter_jit(trial_biases)
 _filter = eqx.filter_jit(filter_trial)
 _solve = eqx.filter_jit(solve_segments)
-_judge = eqx.filter_jit(judge_segments)
 _prior = eqx.filter_jit(signal_prior)
 
 
@@ -225,18 +199,14 @@ def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 1
 
 
 def _solve_some(
-    trial, departures, table, segments: Segments, mine, prior, sizes: Sizes, options, fills: Fills, last: bool
+    trial, departures, table, segments: Segments, mine, prior, sizes: Sizes, options, fills: Fills
 ) -> None:
-    """Solve the segments `mine`, padded to a bucket of lanes, and record them; judge them if nothing follows."""
+    """Solve the segments `mine`, padded to a bucket of lanes, and record them."""
     lanes = bucket(len(mine), 1)
     given = (departures, table[mine], segments.departure[mine], segments.arrival[mine])
     (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x, lanes), given)
-    problem = (trial, states, covariances, table, departure, arrival, prior, sizes)
-    found, values = _solve(*problem, options)
-    fills.record(trial, mine, found, values)
-    if last and prior is not None:
-        judged = _judge(*problem, found.delta)
-        fills.record_uncertainty(*judged)
+    found = _solve(trial, states, covariances, table, departure, arrival, prior, sizes, options)
+    fills.record(trial, mine, *found)
 
 
 def compensate_parallel(
@@ -248,16 +218,14 @@ def compensate_parallel(
     prior = _prior(trial) if options.method == "map" else None
     chunks = list(_chunks(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
-    for sweep in range(sweeps):
+    for _ in range(sweeps):
         filtered = _filter(trial, fills.unbiased, fills.variance)
         filtered = jax.tree.map(np.asarray, filtered)
         shifted = eqx.tree_at(lambda t: t.signal, trial, trial.signal - fills.bias[None])
         for mine, sizes in chunks:
             at = np.maximum(segments.departure[mine], 0)
             departures = jax.tree.map(lambda x, at=at: x[at], filtered)
-            _solve_some(
-                shifted, departures, table, segments, mine, prior, sizes, options, fills, sweep == sweeps - 1
-            )
+            _solve_some(shifted, departures, table, segments, mine, prior, sizes, options, fills)
             done += len(mine)
             if progress:
                 progress(done, sweeps * total)
@@ -295,7 +263,7 @@ def compensate_sequential(
         state, covariance = _filter_to(trial, fills, state, covariance, at, departure)
         at = departure
         here = jax.tree.map(lambda x: np.asarray(x)[None], (state, covariance))
-        _solve_some(trial, here, table, segments, np.array([index]), prior, sizes, options, fills, True)
+        _solve_some(trial, here, table, segments, np.array([index]), prior, sizes, options, fills)
         if progress:
             progress(count + 1, len(busy))
     return fills

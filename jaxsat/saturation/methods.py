@@ -19,6 +19,7 @@ from jaxsat.saturation.solvers import (
     projected_gauss_newton,
     projected_gradient,
 )
+from jaxsat.saturation.uncertainty import Uncertainty, uncertainty
 
 Compensation = Literal["direct", "triangle", "quadratic", "map"]
 Solver = Literal["gauss_newton", "projected_gradient"]
@@ -88,6 +89,8 @@ class SegmentFill(eqx.Module):
     """What to add to the noise of each filled value for the path that goes with it."""
     at_bound: Bool[Array, "m"]
     """δ ends at its bound: the bound decided, not the data."""
+    uncertainty: Uncertainty | None
+    """What `map` knows of each value; None for the others."""
     inflated: Bool[Array, "m"]
     """Not filled, because hidden peaks of its like were worse filled; its noise says what it may have lost."""
 
@@ -173,5 +176,8 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
         variance=variance,
         slack=slack,
         at_bound=at_bound,
+        uncertainty=None
+        if known is None
+        else uncertainty(segment, delta, solution.gradient, solution.columns),
         inflated=jnp.zeros_like(real) if known is None else known.harmful,
     )

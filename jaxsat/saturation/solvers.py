@@ -41,6 +41,9 @@ class Solution(eqx.Module):
 
     x: Float[Array, "n"]
     value: Float[Array, ""]
+    gradient: Float[Array, "n"]
+    columns: tuple[Float[Array, "n"], ...]
+    """Of A, as `Linearise` gives them; like the gradient at x."""
     residual: Float[Array, ""]
     """max |u − clip(u − ∂f/∂u)| with u = x / scale: zero exactly at a stationary point of the bounded problem."""
     iterations: Int[Array, ""]
@@ -134,13 +137,23 @@ def projected_gradient(linearise: Linearise, box: Box) -> Solution:
     u, value, error, count, stalled = jax.lax.while_loop(
         proceed, one_round, (u, infinite, infinite, jnp.asarray(0), jnp.asarray(False))
     )
-    return _solution(u * box.scale, value, error, count, stalled, box.tolerance)
+    _, gradient, columns, _ = _assess(linearise, u, box.scale, low, high)
+    return _solution(box, u, (value, gradient, columns, error), count, stalled)
 
 
-def _solution(x, value, error, count, stalled, tolerance) -> Solution:
+def _solution(box: Box, u, at, count, stalled) -> Solution:
+    """at: of `_assess` at u."""
+    value, gradient, columns, error = at
     unfinished = jnp.where(stalled, Status.STALLED, Status.MAX_ITERATIONS)
-    status = jnp.where(error <= tolerance, Status.CONVERGED, unfinished)
-    return Solution(x=x, value=value, residual=error, iterations=count, status=status)
+    return Solution(
+        x=u * box.scale,
+        value=value,
+        gradient=gradient / box.scale,
+        columns=tuple(column / box.scale for column in columns),
+        residual=error,
+        iterations=count,
+        status=jnp.where(error <= box.tolerance, Status.CONVERGED, unfinished),
+    )
 
 
 # Damping, relative to a scaled diagonal of 1: where it starts, the least there is (or the tolerance where that is
@@ -199,10 +212,10 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
     infinite, zero = jnp.full((), jnp.inf, u.dtype), jnp.zeros((), u.dtype)
     nothing = (infinite, jnp.zeros_like(u), tuple(jnp.zeros_like(u) for _ in range(rank)), infinite)
     damping = jnp.full((), first, u.dtype)
-    u, _, (value, _, _, error), _, damping, count = jax.lax.while_loop(
+    u, _, at, _, damping, count = jax.lax.while_loop(
         proceed, step, (u, u, nothing, zero, damping, jnp.asarray(0))
     )
-    return _solution(u * box.scale, value, error, count - 1, damping >= most, box.tolerance)
+    return _solution(box, u, at, count - 1, damping >= most)
 
 
 # Where the slope of a search along a line is looked at: near zero first, since small damping makes kinks there.

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxsat.inertial.dense import solve_positive
 from jaxsat.saturation.prior import spread
-from jaxsat.saturation.segment import Segment, condense, value_gradient_root
+from jaxsat.saturation.segment import Segment
 
 # A cut-off further than so many sd into the tail: what is left there behaves as at this one.
 _FURTHEST = 6.0
@@ -29,12 +29,18 @@ class Uncertainty(eqx.Module):
     """Share of the prior's variance of that sum which the rests removed: 0 where the prior alone decides."""
 
 
-def uncertainty(segment: Segment, delta: Float[Array, "m"], gravity: Float[Array, ""]) -> Uncertainty:
-    """At the mode δ of a segment that has a signal prior."""
+def uncertainty(
+    segment: Segment,
+    delta: Float[Array, "m"],
+    slope: Float[Array, "m"],
+    columns: tuple[Float[Array, "m"], ...],
+) -> Uncertainty:
+    """At the mode δ of a segment that has a signal prior.
+
+    slope: of f(δ) and the prior's energy there; columns: of A.
+    """
     known = segment.known
     assert known is not None, "the signal prior was gathered"
-    _, slope, columns = value_gradient_root(delta, condense(segment), gravity)
-    slope = slope + known.slope + known.precision @ delta
     before = known.covariance()
     A = jnp.stack(columns, axis=1)
     seen = before @ A
@@ -42,18 +48,22 @@ def uncertainty(segment: Segment, delta: Float[Array, "m"], gravity: Float[Array
     after = before - seen @ solve_positive(inner, seen.T)
 
     real = segment.bound > 0.0
-    member = (segment.gap[None, :] == jnp.arange(len(delta))[:, None]) & real[None, :]
-    weight = member.astype(delta.dtype)
-    gap_before, gap_after = (jnp.sum(weight @ cov * weight, axis=1) for cov in (before, after))
+    together = (segment.gap[:, None] == segment.gap[None]) & real[:, None] & real[None]
+
+    def of_gap(covariance):
+        rows = jnp.sum(jnp.where(together, covariance, 0.0), axis=1)
+        return jnp.zeros_like(rows).at[segment.gap].add(rows)[segment.gap]
+
+    gap_before, gap_after = of_gap(before), of_gap(after)
     share = 1.0 - gap_after / jnp.where(gap_before > 0.0, gap_before, 1.0)
-    gap_sd = jnp.sqrt(jnp.maximum(gap_after, 0.0))[segment.gap]
+    gap_sd = jnp.sqrt(jnp.maximum(gap_after, 0.0))
     # Where a bound holds δ, the Gaussian's own centre lies beyond it.
     centre, sd = delta - after @ slope, jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
     sd = jnp.where(known.harmful, jnp.sqrt(spread(known)), truncated_sd(centre, sd, segment.bound))
     return Uncertainty(
         sd=jnp.where(real, sd, 0.0),
         gap_sd=jnp.where(real, gap_sd, 0.0),
-        identified=jnp.where(real, share[segment.gap], 0.0),
+        identified=jnp.where(real, share, 0.0),
     )
 
 
