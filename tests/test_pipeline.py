@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,6 +12,9 @@ from scipy.spatial.transform import Rotation
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
 from jaxsat.pipeline import LATEST_FIRST_REST, estimate
+from jaxsat.present.tables import gaps_table
+from jaxsat.saturation import compensate
+from jaxsat.saturation.compensate import signal_prior
 from jaxsat.signals.readers import read
 from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
 from jaxsat.studies.motions import Bar, Walk
@@ -86,6 +90,25 @@ def test_the_path_of_map_takes_filled_rates_as_measured_and_its_covariance_does_
     sure, unsure = (np.diagonal(x.trajectory.covariance, axis1=1, axis2=2) for x in (plain, found))
     # Linearised about paths that differ by a little.
     assert (unsure >= sure * (1 - 1e-4)).all() and (unsure.max(axis=0) > 1.01 * sure.max(axis=0)).any()
+
+
+def test_what_map_would_worsen_is_left_as_measured_and_only_taken_as_noisier(monkeypatch):
+    recording, truth = bar(3, gyr_rail=7.5)
+
+    def all_harmful(trial):
+        prior = signal_prior(trial)
+        return eqx.tree_at(lambda p: p.harmful, prior, jnp.ones_like(prior.harmful))
+
+    monkeypatch.setattr(compensate, "_prior", jax.jit(all_harmful))
+    found = estimate(recording, load_config(None, method="map", **BAR))
+    np.testing.assert_array_equal(found.filled, recording.signal)
+    np.testing.assert_array_equal(found.fills.inflated, truth.saturated)
+    assert list(gaps_table(found)["status"]) == ["inflated"]
+    # As noisy as what the prior says was lost; with that freedom the path is better than without.
+    sd = found.signal_sd[truth.saturated]
+    assert (sd > 0.05).all() and sd.max() > 1.0
+    standard = np.linalg.norm(found.standard_position[-1] - truth.position[-1])
+    assert last_error(found, truth) < 0.5 * standard
 
 
 def test_map_leaves_at_most_a_tenth_of_the_error_on_the_bar():
