@@ -55,6 +55,12 @@ def test_every_experiment_has_its_settings_and_a_method_for_each_goal(script):
         assert set(whole) == set(quick) and whole["title"] and whole["about"]
 
 
+def test_the_page_is_that_of_the_results_that_are_there(script):
+    out = ROOT / "results" / "paper"
+    done = {name: script.settings(name) for name in script.EXPERIMENTS if (out / name / "table.csv").exists()}
+    assert (out / "README.md").read_text() == script.page.page(out, done)
+
+
 @pytest.mark.slow
 def test_table_1_each_method_beats_the_ratio_of_the_paper(run):
     table = run("bar")

@@ -92,6 +92,16 @@ def test_the_path_of_map_takes_filled_rates_as_measured_and_its_covariance_does_
     assert (unsure >= sure * (1 - 1e-4)).all() and (unsure.max(axis=0) > 1.01 * sure.max(axis=0)).any()
 
 
+def test_a_path_is_free_where_the_bound_holds_a_rate():
+    """δ_b of 2 where up to 3.5 are lost: the path of `map` is not held to rates that are known to be too low."""
+    recording, truth = bar(3, gyr_rail=7.5)
+    found = estimate(recording, load_config(None, method="map", **{**BAR, "saturation.gyr_bound": 2.0}))
+    assert found.fills.at_bound.sum() > 5
+    assert ((found.fills.slack > found.fills.slack[0, 0]) == found.fills.at_bound).all()
+    standard = np.linalg.norm(found.standard_position[-1] - truth.position[-1])
+    assert last_error(found, truth) < 0.1 * standard
+
+
 def test_what_map_would_worsen_is_left_as_measured_and_only_taken_as_noisier(monkeypatch):
     recording, truth = bar(3, gyr_rail=7.5)
 

@@ -167,8 +167,11 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     # δ of `map` is the mode together with the path, which takes it as measured: a smoother that is free to turn what
     # is filled once more lets it account for what other axes did. Accelerometers saturate in impacts, which no smooth
     # prior describes; there the path is better off with some freedom.
-    slack = variance if known is None else jnp.where((segment.channel < 3) & ~known.harmful, 0.0, variance)
     at_bound = real & (delta >= segment.bound * (1.0 - 1e-9))
+    # So it is where a bound holds δ, or nothing is filled.
+    slack = variance
+    if known is not None:
+        slack = jnp.where((segment.channel < 3) & ~known.harmful & ~at_bound, 0.0, variance)
     return SegmentFill(
         delta=delta,
         cost_before=before,

@@ -143,7 +143,8 @@ def _table(rows: pd.DataFrame, chosen: Settings) -> str:
     column = next(iter(chosen["paper"]))
     sensor, unit = ("gyr", "rad/s") if "gyr" in chosen["rails"] else ("acc", "m/s²")
     cells = []
-    for row in rows.set_index("method", drop=False).loc[list(LABELS)[2:]].to_dict("records"):
+    there = [method for method in LABELS if method in set(rows["method"])]
+    for row in rows.set_index("method", drop=False).loc[there].to_dict("records"):
         method, paper = row["method"], chosen["paper"]
         cell: dict[str, Any] = {"": LABELS[method]}
         for name, values in paper.items():
