@@ -15,10 +15,24 @@ from jaxsat.config import Config
 from jaxsat.errors import InputError
 from jaxsat.inertial.orientation import Gains, Start, backward
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
-from jaxsat.inertial.smoother import ActiveSet, Rows, Smoothed, smooth, smooth_nonnegative
+from jaxsat.inertial.smoother import (
+    ActiveSet,
+    Filtered,
+    Rows,
+    Smoothed,
+    displacement_covariance,
+    smooth,
+    smooth_nonnegative,
+)
 from jaxsat.inertial.strapdown import NavState, Samples, prefixes, sample_intervals
-from jaxsat.saturation.compensate import Fills, compensate_parallel, compensate_sequential
-from jaxsat.saturation.layout import Trial
+from jaxsat.saturation.compensate import (
+    Fills,
+    compensate_parallel,
+    compensate_sequential,
+    filter_recording,
+)
+from jaxsat.saturation.false_rests import false_rests
+from jaxsat.saturation.layout import Trial, bucket, pad
 from jaxsat.saturation.methods import Compensation, Options
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
@@ -55,6 +69,8 @@ class Estimate(eqx.Module):
     recording: Recording
     config: Config = eqx.field(static=True)
     trajectory: Trajectory
+    problem: Trial
+    """The recording as filled, padded, with the variances and rows that the trajectory's covariance follows from."""
     rails: Rails
     rest: Bool[np.ndarray, "N"]
     segments: Segments
@@ -118,6 +134,12 @@ class Prepared(eqx.Module):
 
 def prepare(recording: Recording, config: Config) -> Prepared:
     """All that is done to a recording before it is smoothed; raises `InputError` as `estimate` does."""
+    with jax.enable_x64(True):
+        return _prepare(recording, config)[0]
+
+
+def _prepare(recording: Recording, config: Config) -> tuple[Prepared, Filtered]:
+    """And the filter pass over it, saturated values being free within their bounds."""
     warnings = check(recording)
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
     saturated, sign = saturation_mask(recording, rails)
@@ -131,8 +153,27 @@ def prepare(recording: Recording, config: Config) -> Prepared:
         at_rail,
     )
     rest = rest & ~at_rail & ~recording.missing.all(axis=1)
-    trial, offset = _trial(recording, config, rest, sign)
-    return Prepared(trial, offset, rails, rest, find_segments(rest), find_gaps(sign), sign, warnings)
+    while True:
+        trial, offset = _trial(recording, config, rest, sign)
+        segments, searched = find_segments(rest), _without_floor(trial, config)
+        filtered = filter_recording(searched, trial.signal, trial.unfilled_variance)
+        false = false_rests(searched, segments, filtered)
+        if not false.any():
+            break
+        for start, end in zip(segments.arrival[false], segments.rest_end[false], strict=True):
+            rest[start:end] = False
+            warnings.append(
+                f"the rest from {recording.time[start]:.2f} to {recording.time[end]:.2f} s is left out: the motions "
+                "before and after it say that the sensor moved."
+            )
+    return Prepared(trial, offset, rails, rest, segments, find_gaps(sign), sign, warnings), filtered
+
+
+def _without_floor(trial: Trial, config: Config) -> Trial:
+    """An inequality acts on the whole trajectory only: a single segment is searched without it."""
+    if config.height.mode == "nonnegative":
+        return eqx.tree_at(lambda t: t.rows.height, trial, None)
+    return trial
 
 
 def search_options(config: Config, method: str) -> Options:
@@ -153,22 +194,21 @@ def search_options(config: Config, method: str) -> Options:
 
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
     clock = _Clock()
-    prepared = prepare(recording, config)
+    prepared, filtered = _prepare(recording, config)
     trial, segments, gaps = prepared.trial, prepared.segments, prepared.gaps
     clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))
     standard, floor = _smooth(trial, config)
-    smoothed = standard
+    smoothed, sure = standard, trial
     clock.lap("smoother")
     if config.method != "standard" and len(gaps):
         options = search_options(config, config.method)
         report = partial(progress, "segments")
-        # An inequality acts on the whole trajectory only: a single segment is searched without it.
-        searched = trial
-        if config.height.mode == "nonnegative":
-            searched = eqx.tree_at(lambda t: t.rows.height, trial, None)
+        searched = _without_floor(trial, config)
         if config.saturation.segments == "parallel":
-            fills = compensate_parallel(searched, segments, options, config.saturation.sweeps, report)
+            fills = compensate_parallel(
+                searched, segments, options, config.saturation.sweeps, report, filtered
+            )
         else:
             fills = compensate_sequential(searched, segments, options, report)
         clock.lap("compensation")
@@ -205,6 +245,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
             velocity=np.asarray(smoothed.state.velocity)[:n],
             covariance=np.asarray(smoothed.covariance)[:n],
         ),
+        problem=sure,
         rails=prepared.rails,
         rest=prepared.rest,
         segments=segments,
@@ -221,6 +262,38 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         floor=floor,
         warnings=prepared.warnings,
         seconds=clock.seconds,
+    )
+
+
+def displacements(found: Estimate) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3 3"]]:
+    """The way from departure to arrival of each segment (m), and its covariance (m²).
+
+    NaN where no rest precedes or follows, the covariance also where heights are used, which tie ways together.
+    """
+    segments, n = found.segments, len(found.recording)
+    whole = (segments.departure >= 0) & (segments.arrival < n)
+    way, covariance = np.full((len(segments), 3), np.nan), np.full((len(segments), 3, 3), np.nan)
+    ends = np.stack([segments.departure, segments.arrival])[:, whole]
+    position = found.trajectory.position
+    way[whole] = position[ends[1]] - position[ends[0]]
+    if whole.any() and found.config.height.mode == "off":
+        problem, size = found.problem, len(found.problem.period)
+        # Padding repeats the last motion.
+        count = int(whole.sum())
+        departure, arrival = np.pad(ends, ((0, 0), (0, bucket(count, 16) - count)), mode="edge")
+        states = found.trajectory.q_nb, found.trajectory.velocity, position, found.trajectory.covariance
+        with jax.enable_x64(True):
+            ways = _ways(problem, *(pad(x, size) for x in states), departure, arrival)
+        covariance[whole] = np.asarray(ways)[:count]
+    return way, covariance
+
+
+@eqx.filter_jit
+def _ways(problem: Trial, q_nb, velocity, position, covariance, departure, arrival):
+    samples = Samples(problem.signal, problem.period, problem.variance)
+    start = NavState(q_nb, velocity, position)
+    return displacement_covariance(
+        start, covariance, samples, problem.rows, problem.prior_covariance, departure, arrival
     )
 
 

@@ -44,11 +44,11 @@ def objective_vs_strapdown() -> Iterator[Row]:
     batch = bars(256)
 
     def segment(trial):
-        states, covariances = filter_trial(trial, trial.signal, trial.unfilled_variance)
+        filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
         at = batch.departure[0]
-        state = jax.tree.map(lambda x: x[at], states)
+        state, covariance, _ = jax.tree.map(lambda x: x[at], filtered)
         found, _ = gather(
-            trial, at, batch.arrival[0], state, covariances[at], batch.table(trial)[0], batch.sizes
+            trial, at, batch.arrival[0], state, covariance, batch.table(trial)[0], batch.sizes
         )
         return condense(found)
 

@@ -88,8 +88,8 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
     table = batch.table(trial)
     stop = len(trial.period) if whole else int(batch.departure[0]) + 1
     first = jax.tree.map(lambda x: x[:stop] if np.ndim(x) and len(x) == len(trial.period) else x, trial)
-    states, covariances = filter_trial(first, first.signal, jnp.where(sure, 0.0, first.unfilled_variance))
-    state, covariance = jax.tree.map(lambda x: x[batch.departure], (states, covariances))
+    filtered = filter_trial(first, first.signal, jnp.where(sure, 0.0, first.unfilled_variance))
+    state, covariance, _ = jax.tree.map(lambda x: x[batch.departure], filtered)
     return solve_segments(
         trial, state, covariance, table, batch.departure, batch.arrival, None, batch.sizes, options
     )

@@ -37,7 +37,7 @@ def problem():
     rows = Rows(rest.rest, rest.velocity_variance, None, rest.height_variance)
     prior, covariance = problems.departure()
     samples = problems.samples(N)
-    reference, _ = closed_loop(samples, rows, prior, covariance, problems.GRAVITY)
+    reference = closed_loop(samples, rows, prior, covariance, problems.GRAVITY).state
     # The quadratic has its prior at the first state of the reference.
     reference = jax.tree.map(lambda x, first: x.at[0].set(first), reference, prior)
     return reference, samples, rows, prior, covariance

@@ -149,7 +149,7 @@ def test_map_on_a_recording_that_truly_saturated(shared_data):
     mapped, standard = (
         position_rmse(position, truth) for position in (found.trajectory.position, found.standard_position)
     )
-    assert mapped <= 0.7 * standard
+    assert mapped <= 0.85 * standard
 
 
 @pytest.mark.parametrize("method", [*PAPER, "map"])

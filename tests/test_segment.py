@@ -130,7 +130,7 @@ def test_gauss_newton_factor_is_the_sensitivity_of_the_arrival_in_the_metric_of_
     signal = SAMPLES.signal.at[sample, segment.channel[:6]].add(segment.sign[:6] * DELTA[:6])
     samples = jax.tree.map(lambda x: x[:MOVING], Samples(signal, SAMPLES.period, SAMPLES.variance))
     nowhere = problems.rows(np.zeros(MOVING, bool))
-    _, P = closed_loop(samples, nowhere, state, covariance, problems.GRAVITY)
+    P = closed_loop(samples, nowhere, state, covariance, problems.GRAVITY).covariance
     P = P[-1][np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])]
     R = quat_to_matrix(quat_conjugate(end.q_nb))
     D = np.kron(np.eye(2), R)

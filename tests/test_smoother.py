@@ -12,6 +12,7 @@ from jaxsat.inertial.smoother import (
     VELOCITY,
     Rows,
     closed_loop,
+    displacement_covariance,
     smooth,
     smooth_about,
     smooth_nonnegative,
@@ -40,8 +41,11 @@ def at(tree, k):
     return jax.tree.map(lambda x: x[k], tree)
 
 
-def dense(reference, samples, rows, prior, prior_covariance, extra_rows=None):
-    """Means, covariances and J* of the joint Gaussian, from one dense conditioning (nothing is inverted but S)."""
+def dense(reference, samples, rows, prior, prior_covariance, whole=False):
+    """Means, covariances and J* of the joint Gaussian, from one dense conditioning (nothing is inverted but S).
+
+    whole: the covariance of all states together in place of multipliers.
+    """
     intervals = sample_intervals(samples.signal, samples.period)
     size = 9 * (N + 1)
     mean, root = np.zeros((N + 1, 9)), np.zeros((N + 1, 9, size))
@@ -80,7 +84,7 @@ def dense(reference, samples, rows, prior, prior_covariance, extra_rows=None):
         (flat + gain @ innovation).reshape(N + 1, 9),
         blocks,
         0.5 * innovation @ np.linalg.solve(S, innovation),
-        np.linalg.solve(S, innovation),
+        posterior if whole else np.linalg.solve(S, innovation),
     )
 
 
@@ -106,7 +110,7 @@ def test_means_covariances_and_cost_equal_the_dense_system(exact_start):
     if exact_start:  # heading and position are known exactly: a singular prior too
         covariance = jnp.diag(jnp.array([1e-5, 1e-5, 0, 0, 0, 0, 1e-4, 1e-4, 1e-4]))
     rows = problems.rows(REST, HEIGHTS)
-    corrected, _ = closed_loop(SAMPLES, rows, prior, covariance, problems.GRAVITY)
+    corrected = closed_loop(SAMPLES, rows, prior, covariance, problems.GRAVITY).state
     for reference in (strapdown(SAMPLES.signal, SAMPLES.period, prior, problems.GRAVITY), corrected):
         found = SMOOTH_ABOUT(reference, SAMPLES, rows, prior, covariance, problems.GRAVITY)
         mean, blocks, cost, _ = dense(reference, SAMPLES, rows, prior, covariance)
@@ -145,7 +149,7 @@ def test_last_state_of_the_closed_loop_is_the_kalman_filter():
     """Filter and smoother agree at the end, where no row follows, but for linearisation."""
     samples, prior, covariance = almost_still()
     rows = problems.rows(REST)
-    states, filtered = closed_loop(samples, rows, prior, covariance, problems.GRAVITY)
+    states, filtered, _ = closed_loop(samples, rows, prior, covariance, problems.GRAVITY)
     found = SMOOTH(samples, rows, prior, covariance, problems.GRAVITY, jnp.asarray(0))
     scale = np.sqrt(np.diag(filtered[-1]).clip(1e-12))
     assert (np.abs(filtered[-1] - found.covariance[-1]) < 2e-2 * np.outer(scale, scale)).all()
@@ -216,3 +220,24 @@ def test_height_inequality_is_the_solution_of_the_bounded_quadratic_problem():
                 costs.append(float(tried.cost))
         np.testing.assert_allclose(found.cost, min(costs), rtol=1e-6)
         assert int(floor.active.sum()) == int((multipliers > 0).sum())
+
+
+def test_the_way_of_a_motion_is_as_well_known_as_the_dense_system_says():
+    """r(arrival) − r(departure) of both motions, rows before and after them included."""
+    prior, covariance = problems.departure()
+    rows = Rows(jnp.asarray(REST), 1e-4 * jnp.ones(N), None, jnp.ones(N))
+    samples = problems.samples(N)
+    reference = strapdown(samples.signal, samples.period, prior, problems.GRAVITY)
+    unseen = Rows(rows.rest, rows.velocity_variance, jnp.zeros(N, bool), rows.height_variance)
+    _, _, _, joint = dense(reference, samples, unseen, prior, covariance, whole=True)
+    found = SMOOTH_ABOUT(reference, samples, rows, prior, covariance, problems.GRAVITY)
+    departure, arrival = jnp.array([7, 32]), jnp.array([25, 50])
+    # Linearised about the same states as the dense system.
+    start, known = jax.tree.map(lambda x: x[:-1], (reference, found.covariance))
+    ways = jax.jit(displacement_covariance)(start, known, samples, rows, covariance, departure, arrival)
+    for way, i, j in zip(ways, departure.tolist(), arrival.tolist(), strict=True):
+        a, b = (slice(9 * k + 3, 9 * k + 6) for k in (i, j))
+        expected = joint[b, b] + joint[a, a] - joint[a, b] - joint[b, a]
+        np.testing.assert_allclose(way, expected, atol=1e-8 * np.abs(expected).max())
+        # Better than positions apart, which share the error of where the motion began.
+        assert np.trace(way) < np.trace(joint[a, a]) + np.trace(joint[b, b])

@@ -15,7 +15,7 @@ from jaxsat.pipeline import estimate
 from jaxsat.present import folder as folder_module
 from jaxsat.present.folder import check_folder, write_results
 from jaxsat.present.summary import inspect, summarise, warnings_of
-from jaxsat.present.tables import gaps_table, signals_table, trajectory_table
+from jaxsat.present.tables import gaps_table, segments_table, signals_table, trajectory_table
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.rails import find_gaps
 from jaxsat.signals.recording import CHANNELS
@@ -38,6 +38,7 @@ SIGNALS = [
     *(f"sat_{channel}" for channel in CHANNELS),
     *(f"{channel}_sd" for channel in CHANNELS),
 ]
+SEGMENTS = ["segment", "start", "end", "saturated", "length", "length_sd", "climb", "climb_sd", "status"]
 GAPS = ["channel", "start", "end", "rail", "peak", "peak_sd", "impulse", "impulse_sd", "identified", "status"]
 
 
@@ -75,6 +76,29 @@ def test_segments_are_numbered_between_rests(found):
     for number, arrival in enumerate(found.segments.arrival):
         inside = table.index[table["segment"] == number]
         np.testing.assert_array_equal(inside, np.arange(found.segments.departure[number] + 1, arrival))
+
+
+def test_a_segment_has_the_way_between_its_rests(found, simulated):
+    """The covariance behind its sd is compared with a dense system in test_smoother."""
+    table = segments_table(found)
+    assert list(table.columns) == SEGMENTS and len(table) == len(found.segments)
+    row, truth = table.iloc[0], simulated[1].position
+    i, j = int(found.segments.departure[0]), int(found.segments.arrival[0])
+    assert row["start"] == found.recording.time[i + 1] and row["end"] == found.recording.time[j]
+    assert row["saturated"] == found.saturated[i + 1 : j].sum() > 0 and row["status"] == "converged"
+    way = found.trajectory.position[j] - found.trajectory.position[i]
+    assert row["length"] == pytest.approx(np.hypot(*way[:2])) and row["climb"] == way[2]
+    assert abs(row["length"] - np.hypot(*(truth[j] - truth[i])[:2])) < 4 * row["length_sd"] < 0.1
+    # It is known better than where it ends: some of that is unknown from the rest before it on.
+    sd = trajectory_table(found)["pos_z_sd"]
+    assert 0.9 * sd[j] < row["climb_sd"] < sd[j]
+
+
+def test_a_way_without_a_rest_at_both_ends_is_empty(found):
+    n = len(found.recording)
+    cut = eqx.tree_at(lambda e: (e.segments.arrival, e.segments.rest_end), found, (np.array([n]),) * 2)
+    table = segments_table(cut)
+    assert table[["length", "length_sd", "climb", "climb_sd"]].isna().all(axis=None)
 
 
 def test_signals_have_the_documented_columns_and_change_only_where_saturated(found, simulated):
@@ -192,6 +216,7 @@ def test_results_are_written_whole_and_replaced(found, ignored, tmp_path):
         "trajectory.parquet",
         "signals.parquet",
         "gaps.parquet",
+        "segments.parquet",
         "summary.json",
         "report.html",
     }

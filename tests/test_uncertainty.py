@@ -32,7 +32,9 @@ def known_segment(scale: float):
     root = np.random.default_rng(0).normal(size=(6, 6))
     precision = np.eye(8)
     precision[:6, :6] = (root @ root.T + np.eye(6)) * scale
-    prior = Known(jnp.asarray(precision), jnp.zeros(8), jnp.ones(8), jnp.zeros(8, bool))
+    covariance = jnp.asarray(np.linalg.inv(precision))
+    variance, harmful = jnp.diagonal(covariance), jnp.zeros(8, bool)
+    prior = Known(jnp.asarray(precision), jnp.zeros(8), covariance, variance, harmful)
     segment = build(False)
     gaps = jnp.array([0, 0, 1, 2, 3, 4, 7, 7])
     return eqx.tree_at(lambda s: (s.known, s.gap), segment, (prior, gaps), is_leaf=lambda x: x is None)

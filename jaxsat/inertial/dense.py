@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def _one_by_one(function: Callable) -> Callable:
+def one_by_one(function: Callable) -> Callable:
+    """The same function; under `vmap` on a CPU called for one element of the batch after the other."""
     single = jax.custom_batching.sequential_vmap(function)
 
     def call(*matrices):
@@ -21,10 +22,10 @@ def _one_by_one(function: Callable) -> Callable:
     return call
 
 
-_solve_positive = _one_by_one(
+_solve_positive = one_by_one(
     lambda matrix, right: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right)
 )
-_eigh = _one_by_one(lambda matrix: tuple(jnp.linalg.eigh(matrix)))
+_eigh = one_by_one(lambda matrix: tuple(jnp.linalg.eigh(matrix)))
 
 
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:

@@ -6,7 +6,7 @@ height row at the first sample of each rest, as an equality with a given sd or a
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial import kalman
+from jaxsat.inertial.dense import solve_positive
 from jaxsat.inertial.strapdown import (
     Interval,
     NavState,
@@ -83,18 +84,29 @@ def update_rows(
     return mean, covariance, cost, done
 
 
+class Filtered(NamedTuple):
+    """What is known of each state by its own rows and all before."""
+
+    state: NavState
+    """N+1 of them."""
+    covariance: Float[Array, "N1 n n"]
+    """Of [θ, r, v], or of [θ, v] where no height is observed."""
+    cost: Float[Array, "N"]
+    """½ innovation² over its variance, summed over the rows of each state: in all, J*."""
+
+
 def closed_loop(
     samples: Samples,
     rows: Rows,
     prior: NavState,
     prior_covariance: Float[Array, "p p"],
     gravity: Float[Array, ""],
-) -> tuple[NavState, Float[Array, "N1 n n"]]:
+) -> Filtered:
     """Extended Kalman filter: strapdown that is corrected at each row.
 
-    Returns the N+1 corrected states and their filtered covariances. They are the reference of the smoother's first
-    linearisation and the departure of each segment (Section 5). Covariances, the prior's too, are of [θ, r, v] or,
-    where no height is observed, of [θ, v]: position is then integrated, not corrected.
+    Its states are the reference of the smoother's first linearisation and the departure of each segment (Section 5).
+    Covariances, the prior's too, are of [θ, r, v] or, where no height is observed, of [θ, v]: position is then
+    integrated, not corrected.
     """
     size = 6 if rows.height is None else 9
 
@@ -108,18 +120,18 @@ def closed_loop(
         state, covariance = carry
         interval, sample, row = inputs
         nothing = jnp.zeros(size, covariance.dtype)
-        mean, covariance, _, _ = update_rows(nothing, covariance, state, row)
+        mean, covariance, cost, _ = update_rows(nothing, covariance, state, row)
         unseen = jnp.zeros(9 - size, mean.dtype)
         state = add_error(state, jnp.concatenate([mean[:3], unseen, mean[3:]]))
         transition = part(error_transition(state.q_nb, interval))
         noise = part(sample_noise(state.q_nb, sample.signal, sample.period, sample.variance))
         spread = kalman.product(kalman.product(transition, covariance), transition.T) + noise
         predicted = 0.5 * (spread + spread.T)
-        return (advance(state, interval, gravity), predicted), (state, covariance)
+        return (advance(state, interval, gravity), predicted), ((state, covariance), cost)
 
     intervals = sample_intervals(samples.signal, samples.period)
-    last, corrected = jax.lax.scan(step, (prior, part(prior_covariance)), (intervals, samples, rows))
-    return jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last)
+    last, (corrected, cost) = jax.lax.scan(step, (prior, part(prior_covariance)), (intervals, samples, rows))
+    return Filtered(*jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last), cost)
 
 
 def linearised(
@@ -202,7 +214,7 @@ def smooth(
     relinearisations: Int[Array, ""] | int = 1,
 ) -> Smoothed:
     """The standard smoother of a whole recording: closed-loop reference, then Gauss-Newton."""
-    reference, _ = closed_loop(samples, rows, prior, prior_covariance, gravity)
+    reference = closed_loop(samples, rows, prior, prior_covariance, gravity).state
     first = smooth_about(reference, samples, rows, prior, prior_covariance, gravity)
     return jax.lax.fori_loop(
         0,
@@ -210,6 +222,47 @@ def smooth(
         lambda _, s: smooth_about(s.state, samples, rows, prior, prior_covariance, gravity),
         first,
     )
+
+
+def displacement_covariance(
+    start: NavState,
+    covariance: Float[Array, "N 9 9"],
+    samples: Samples,
+    rows: Rows,
+    prior_covariance: Float[Array, "9 9"],
+    departure: Int[Array, "S"],
+    arrival: Int[Array, "S"],
+) -> Float[Array, "S 3 3"]:
+    """How well the way r(arrival) − r(departure) of each motion is known (m²), given all rows.
+
+    start, covariance: smoothed, at the start of each sample; by the same samples and rows, none of them a height. No
+    row may lie between departure and arrival, and motions follow one another.
+    """
+    begins = jnp.zeros(len(samples.period), bool).at[departure].set(True)
+    moves = jnp.ones(9, bool).at[3:6].set(False)
+
+    # Position that starts at zero with each motion: nothing observes it, so nothing else changes.
+    def step(known, inputs):
+        state, interval, sample, row, begin = inputs
+        _, after, _, _ = update_rows(jnp.zeros(9), known, state, row)
+        after = jnp.where(begin & ~(moves[:, None] & moves[None]), 0.0, after)
+        noise = sample_noise(state.q_nb, sample.signal, sample.period, sample.variance)
+        _, predicted = kalman.predict(
+            jnp.zeros(9), after, error_transition(state.q_nb, interval), jnp.zeros(9), noise
+        )
+        return predicted, known
+
+    intervals = sample_intervals(samples.signal, samples.period)
+    _, before = jax.lax.scan(step, prior_covariance, (start, intervals, samples, rows, begins))
+
+    # What comes after the motion tells of its way by attitude and velocity on arrival only.
+    def at_arrival(before, after):
+        motion = jnp.asarray((0, 1, 2, *VELOCITY))
+        known = before[motion][:, motion]
+        gain = solve_positive(known, before[motion, 3:6]).T
+        return before[3:6, 3:6] - gain @ (known - after[motion][:, motion]) @ gain.T
+
+    return jax.vmap(at_arrival)(before[arrival], covariance[arrival])
 
 
 class ActiveSet(eqx.Module):

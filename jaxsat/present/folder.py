@@ -23,9 +23,20 @@ from jaxsat.present.periodic import (
 )
 from jaxsat.present.report import Track, render_report
 from jaxsat.present.summary import summarise, summarise_orientation
-from jaxsat.present.tables import gaps_table, orientation_table, signals_table, trajectory_table
+from jaxsat.present.tables import (
+    gaps_table,
+    orientation_table,
+    segments_table,
+    signals_table,
+    trajectory_table,
+)
 
-_TABLES = {"trajectory": trajectory_table, "signals": signals_table, "gaps": gaps_table}
+_TABLES = {
+    "trajectory": trajectory_table,
+    "signals": signals_table,
+    "gaps": gaps_table,
+    "segments": segments_table,
+}
 _PERIODIC = {"periodic": motion_table, "signals": periodic_signals_table, "gaps": periodic_gaps_table}
 _KINDS = ("csv", "parquet")
 

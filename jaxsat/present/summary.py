@@ -53,6 +53,8 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
         "cost": {"before": float(estimate.cost_standard), "after": float(estimate.cost)},
         "gravity": float(estimate.gravity),
         "gyr_offset": estimate.gyr_offset.tolist(),
+        "bias": dict(zip(CHANNELS, fills.bias.tolist(), strict=True)),
+        "bias_sd": dict(zip(CHANNELS, fills.bias_sd.tolist(), strict=True)),
         "floor": None
         if floor is None
         else {

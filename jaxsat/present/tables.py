@@ -5,7 +5,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from jaxsat.attitude import Orientation
-from jaxsat.pipeline import Estimate
+from jaxsat.pipeline import Estimate, displacements
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import CHANNELS
 
@@ -103,6 +103,39 @@ def gaps_table(estimate: Estimate) -> pd.DataFrame:
         }
     )
     return table.sort_values(["start", "channel"], ignore_index=True)
+
+
+def segments_table(estimate: Estimate) -> pd.DataFrame:
+    """One row a segment, the stretch of motion between two rests: a stride, where the sensor is on a foot.
+
+    Columns: `segment` (its number, as in the trajectory), `start` and `end` (s), `saturated` (values that saturate in
+    it), `length` (m, horizontal, from the rest before to the rest after), `climb` (m), their `*_sd`, and `status` of
+    its search as in the gaps' table. Lengths are empty where no rest precedes or follows, their sd also where heights
+    of rests are used.
+    """
+    segments, time = estimate.segments, estimate.recording.time
+    way, covariance = displacements(estimate)
+    length = np.hypot(way[:, 0], way[:, 1])
+    along = np.zeros_like(way)
+    along[:, :2] = way[:, :2] / np.maximum(length, 1e-9)[:, None]
+    spread = np.einsum("si,sij,sj->s", along, covariance, along), covariance[:, 2, 2]
+    total = np.concatenate([[0], np.cumsum(estimate.saturated.sum(axis=1))])
+    start = np.maximum(segments.departure + 1, 0)
+    saturated = total[segments.arrival] - total[start]
+    words = np.where(saturated == 0, Status.NOTHING_TO_DO.name.lower(), _status_words(estimate))
+    return pd.DataFrame(
+        {
+            "segment": np.arange(len(segments)),
+            "start": time[np.minimum(start, len(time) - 1)],
+            "end": time[np.minimum(segments.arrival, len(time) - 1)],
+            "saturated": saturated,
+            "length": length,
+            "length_sd": np.sqrt(np.maximum(spread[0], 0.0)),
+            "climb": way[:, 2],
+            "climb_sd": np.sqrt(np.maximum(spread[1], 0.0)),
+            "status": pd.array(words, dtype="string"),
+        }
+    )
 
 
 def orientation_table(found: Orientation) -> pd.DataFrame:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.biases import estimate_biases
-from jaxsat.inertial.smoother import closed_loop
+from jaxsat.inertial.smoother import Filtered, closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.layout import (
@@ -46,6 +46,8 @@ class Fills(eqx.Module):
     """What it adds for the path that goes with the filled signal."""
     bias: Float[np.ndarray, "6"]
     """Of the sensors (rad/s, m/s²); zero where they are not estimated."""
+    bias_sd: Float[np.ndarray, "6"]
+    """Of these; zero where they are not estimated."""
     sd: Float[np.ndarray, "N 6"]
     """Of filled values: by `map` that of their posterior, by the others that of a value anywhere in its bounds."""
     gap_sd: Float[np.ndarray, "N 6"]
@@ -76,6 +78,7 @@ class Fills(eqx.Module):
             variance=np.array(trial.unfilled_variance),
             slack=np.array(trial.unfilled_variance),
             bias=np.zeros(6),
+            bias_sd=np.zeros(6),
             sd=np.zeros(shape),
             gap_sd=np.full(shape, np.nan),
             identified=np.full(shape, np.nan),
@@ -118,7 +121,7 @@ class Fills(eqx.Module):
 
 def filter_trial(
     trial: Trial, signal: Float[Arrays, "N 6"], extra: Float[Arrays, "N 6"]
-) -> tuple[NavState, Float[Array, "N1 s s"]]:
+) -> Filtered:
     """The departures of all segments: one filter pass over the recording with a filled signal.
 
     extra: variance beyond the sensor's. With that of filled values departures know how uncertain their tilt is, and
@@ -164,16 +167,19 @@ def trial_biases(
     extra: Float[Arrays, "N 6"],
     sd: Float[Arrays, "6"],
     start: Float[Arrays, "6"],
-) -> Float[Array, "6"]:
-    """Biases of the sensors (rad/s, m/s²) by one step from `start`, given a filled signal; `extra` as above."""
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    """Biases of the sensors (rad/s, m/s²) by one step from `start`, given a filled signal, and their covariance.
+
+    `extra` as above.
+    """
     samples = Samples(signal, trial.period, trial.variance + extra)
     return estimate_biases(
         samples, trial.rows, trial.prior, trial.prior_covariance, trial.gravity, sd, 1, start
-    )[0]
+    )
 
 
 _bias = eqx.filter_jit(trial_biases)
-_filter = eqx.filter_jit(filter_trial)
+filter_recording = eqx.filter_jit(filter_trial)
 _solve = eqx.filter_jit(solve_segments)
 _prior = eqx.filter_jit(signal_prior)
 
@@ -210,28 +216,37 @@ def _solve_some(
 
 
 def compensate_parallel(
-    trial: Trial, segments: Segments, options: Options, sweeps: int = 2, progress: Progress | None = None
+    trial: Trial,
+    segments: Segments,
+    options: Options,
+    sweeps: int = 2,
+    progress: Progress | None = None,
+    filtered: Filtered | None = None,
 ) -> Fills:
-    """Solve each segment on its own from one filter pass over the recording; then again with the filled signal."""
+    """Solve each segment on its own from one filter pass over the recording; then again with the filled signal.
+
+    filtered: the first of these passes, where it is at hand.
+    """
     fills = Fills.nothing(trial, len(segments))
     table = arrival_table(trial, segments)
     prior = _prior(trial) if options.method == "map" else None
     chunks = list(_chunks(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
-    for _ in range(sweeps):
-        filtered = _filter(trial, fills.unbiased, fills.variance)
-        filtered = jax.tree.map(np.asarray, filtered)
+    for sweep in range(sweeps):
+        if sweep or filtered is None:
+            filtered = filter_recording(trial, fills.unbiased, fills.variance)
+        states, covariances, _ = jax.tree.map(np.asarray, filtered)
         shifted = eqx.tree_at(lambda t: t.signal, trial, trial.signal - fills.bias[None])
         for mine, sizes in chunks:
             at = np.maximum(segments.departure[mine], 0)
-            departures = jax.tree.map(lambda x, at=at: x[at], filtered)
+            departures = jax.tree.map(lambda x, at=at: x[at], (states, covariances))
             _solve_some(shifted, departures, table, segments, mine, prior, sizes, options, fills)
             done += len(mine)
             if progress:
                 progress(done, sweeps * total)
         if options.bias_sd is not None:
-            bias = _bias(trial, fills.signal, fills.variance, options.bias_sd, fills.bias)
-            fills = replace(fills, bias=np.asarray(bias))
+            bias, known = _bias(trial, fills.signal, fills.variance, options.bias_sd, fills.bias)
+            fills = replace(fills, bias=np.asarray(bias), bias_sd=np.sqrt(np.diagonal(known)))
     return fills
 
 
@@ -271,14 +286,36 @@ def compensate_sequential(
 
 def _filter_to(trial: Trial, fills: Fills, state: NavState, covariance, start: int, stop: int):
     """The filtered state at sample `stop`, from that at `start` (whose rows are used already, but at 0)."""
-    count = stop - start + 1
-    size = bucket(count, 256)
+    states, covariances, _ = _filter_span(
+        trial, fills.signal, fills.variance, state, covariance, start, stop + 1, start == 0
+    )
+    at = stop - start
+    return jax.tree.map(lambda x: np.asarray(x[at]), states), np.asarray(covariances[at])
+
+
+def filter_part(
+    trial: Trial,
+    rest: Bool[np.ndarray, "N"],
+    state: NavState,
+    covariance: Float[Arrays, "s s"],
+    start: int,
+    stop: int,
+) -> Filtered:
+    """The filter over samples [start, stop) with other rests, from the filtered state at `start`; nothing filled."""
+    other = eqx.tree_at(lambda t: t.rows.rest, trial, rest)
+    nothing = trial.signal, np.asarray(trial.unfilled_variance)
+    return _filter_span(other, *nothing, state, covariance, start, stop, False)
+
+
+def _filter_span(trial: Trial, signal, extra, state, covariance, start: int, stop: int, fresh: bool):
+    """The filter over samples [start, stop); fresh: the rows of `start` are not used already."""
+    size = bucket(stop - start, 256)
 
     def span(x):
-        return pad(np.asarray(x)[start : stop + 1], size)
+        return pad(np.asarray(x)[start:stop], size)
 
-    fresh = np.arange(size) >= (0 if start == 0 else 1)
-    rows = jax.tree.map(span, trial.rows).marked(lambda flags: flags & fresh)
+    unused = jnp.arange(size) >= (0 if fresh else 1)
+    rows = jax.tree.map(lambda x: jnp.asarray(span(x)), trial.rows).marked(lambda flags: flags & unused)
     part = Trial(
         signal=span(trial.signal),
         period=span(trial.period),
@@ -291,5 +328,4 @@ def _filter_to(trial: Trial, fills: Fills, state: NavState, covariance, start: i
         prior_covariance=covariance,
         gravity=trial.gravity,
     )
-    states, covariances = _filter(part, span(fills.signal), span(fills.variance))
-    return jax.tree.map(lambda x: np.asarray(x[count - 1]), states), np.asarray(covariances[count - 1])
+    return filter_recording(part, span(signal), span(extra))

@@ -140,8 +140,7 @@ def gather(
     way = jnp.where(valid, sign[sample, channel], 0).astype(signal.dtype)
     known = None
     if prior is not None:
-        length = jnp.zeros(m).at[gap].add(jnp.abs(way))[gap]
-        known = of_values(prior, jnp.asarray(trial.signal), start + sample, channel, way, length)
+        known = of_values(prior, jnp.asarray(trial.signal), start + sample, channel, way, gap)
     segment = Segment(
         signal=signal,
         period=window(trial.period),

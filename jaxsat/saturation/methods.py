@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.saturation.gap_shapes import peak, shape_value
-from jaxsat.saturation.prior import spread
 from jaxsat.saturation.segment import Segment, condense, value_and_root, value_gradient_root
 from jaxsat.saturation.solvers import (
     Box,
@@ -163,7 +162,7 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     )
     real = segment.bound > 0.0
     # Where no prior says better, a value lies anywhere within its bounds: uniform in 0 ≤ δ ≤ δ_b.
-    variance = segment.bound**2 / 12.0 if known is None else jnp.where(real, spread(known), 0.0)
+    variance = segment.bound**2 / 12.0 if known is None else known.variance
     # δ of `map` is the mode together with the path, which takes it as measured: a smoother that is free to turn what
     # is filled once more lets it account for what other axes did. Accelerometers saturate in impacts, which no smooth
     # prior describes; there the path is better off with some freedom.

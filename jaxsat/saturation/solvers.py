@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.components import Cholesky, Matrix
-from jaxsat.inertial.dense import solve_positive
+from jaxsat.inertial.dense import one_by_one, solve_positive
 
 with warnings.catch_warnings():
     # jaxopt announces on import that it is no longer developed; it is the solver the project is built on.
@@ -201,7 +201,8 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
         else:
             A = jnp.stack(columns, axis=1)
             hessian = known + A @ A.T + damping * jnp.eye(len(u))
-            d = dense_box_step(gradient, hessian, low - u, high - u)
+            # Beside others that still search, one that is done waits.
+            d = dense_box_step(gradient, hessian, low - u, high - u, proceed(carry))
         there = jnp.clip(u + d, low, high)
         d = there - u
         promised = -jnp.sum(gradient * d) - 0.5 * sum(jnp.sum(a * d) ** 2 for a in columns)
@@ -296,12 +297,18 @@ def dense_box_step(
     hessian: Float[Array, "n n"],
     low: Float[Array, "n"],
     high: Float[Array, "n"],
+    wanted: Bool[Array, ""] | bool = True,
 ) -> Float[Array, "n"]:
     """min over low ≤ d ≤ high of gᵀd + ½ dᵀHd with H positive definite, by projected Newton (Bertsekas 1982).
 
     Variables at a bound that their slope pushes against are held; the others take a Newton step, shortened until
-    the value of its projection is least.
+    the value of its projection is least. Where it is not wanted, the result is of no use and costs nothing.
     """
+    return _dense_box_step(gradient, hessian, low, high, jnp.asarray(wanted))
+
+
+@one_by_one
+def _dense_box_step(gradient, hessian, low, high, wanted):
     fractions = jnp.asarray(0.5 ** np.arange(12.0), gradient.dtype)[:, None]
 
     def newton(carry):
@@ -320,4 +327,5 @@ def dense_box_step(
         return (change > 1e-10 * (1.0 + jnp.max(jnp.abs(d)))) & (count < 50)
 
     start = jnp.clip(jnp.zeros_like(gradient), low, high)
-    return jax.lax.while_loop(proceed, newton, (start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0)))[0]
+    change = jnp.where(wanted, jnp.inf, 0.0).astype(start.dtype)
+    return jax.lax.while_loop(proceed, newton, (start, change, jnp.asarray(0)))[0]

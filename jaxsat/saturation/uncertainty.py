@@ -11,7 +11,6 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 from jaxsat.inertial.dense import solve_positive
-from jaxsat.saturation.prior import spread
 from jaxsat.saturation.segment import Segment
 
 # A cut-off further than so many sd into the tail: what is left there behaves as at this one.
@@ -41,7 +40,7 @@ def uncertainty(
     """
     known = segment.known
     assert known is not None, "the signal prior was gathered"
-    before = known.covariance()
+    before = known.covariance
     A = jnp.stack(columns, axis=1)
     seen = before @ A
     inner = jnp.eye(A.shape[1]) + A.T @ seen
@@ -59,7 +58,7 @@ def uncertainty(
     gap_sd = jnp.sqrt(jnp.maximum(gap_after, 0.0))
     # Where a bound holds δ, the Gaussian's own centre lies beyond it.
     centre, sd = delta - after @ slope, jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
-    sd = jnp.where(known.harmful, jnp.sqrt(spread(known)), truncated_sd(centre, sd, segment.bound))
+    sd = jnp.where(known.harmful, jnp.sqrt(known.variance), truncated_sd(centre, sd, segment.bound))
     return Uncertainty(
         sd=jnp.where(real, sd, 0.0),
         gap_sd=jnp.where(real, gap_sd, 0.0),

@@ -198,7 +198,7 @@ def score(
         def once(before, _, option=option, prior=prior):
             filled, extra, _, bias = before
             filtered = filter_trial(trial, filled - bias[None], extra)
-            states, covariances = jax.tree.map(lambda x: x[at], filtered)
+            states, covariances, _ = jax.tree.map(lambda x: x[at], filtered)
             shifted = eqx.tree_at(lambda t: t.signal, trial, signal - bias[None])
             fill, values = solve_segments(
                 shifted, states, covariances, case.table, case.departure, case.arrival, prior, sizes, option
@@ -209,7 +209,7 @@ def score(
             extra, slack = (unfilled.at[place].set(x, mode="drop") for x in (fill.variance, fill.slack))
             if option.bias_sd is not None:
                 # A recording that does not saturate is left as it is.
-                moved = trial_biases(trial, filled, extra, option.bias_sd, bias)
+                moved, _ = trial_biases(trial, filled, extra, option.bias_sd, bias)
                 bias = jnp.where(jnp.any(sign != 0), moved, 0.0)
             return (filled, extra, slack, bias), (fill, values)
 

@@ -118,8 +118,8 @@ def problem_of(recording: Recording, config: Config, method: str) -> tuple[Prepa
 @partial(jax.jit, static_argnames="learned")
 def _gathered(trial: Trial, departure, arrival, table, learned: bool) -> tuple[Segment, Condensed]:
     trial = jax.tree.map(jnp.asarray, trial)
-    states, covariances = filter_trial(trial, trial.signal, trial.unfilled_variance)
-    state, covariance = jax.tree.map(lambda x: x[departure], (states, covariances))
+    filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
+    state, covariance, _ = jax.tree.map(lambda x: x[departure], filtered)
     known = signal_prior(trial) if learned else None
     segment, _ = gather(trial, departure, arrival, state, covariance, table, SIZES, known)
     return segment, condense(segment)
