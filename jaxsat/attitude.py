@@ -22,7 +22,7 @@ from jaxsat.inertial.orientation import (
     start_at_rest,
 )
 from jaxsat.inertial.strapdown import Samples
-from jaxsat.pipeline import LEFT_OFFSET_SD, MOVING_START_SD, MOVING_START_TILT_SD, given_gains
+from jaxsat.preparation import LEFT_OFFSET_SD, MOVING_START_SD, MOVING_START_TILT_SD, given_gains
 from jaxsat.saturation.interpolation import interpolate_gaps
 from jaxsat.signals.checks import TILT, check
 from jaxsat.signals.formats import GRAVITY

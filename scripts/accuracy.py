@@ -27,7 +27,8 @@ from peers.gaitmap_rts import rts_kalman
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
-from jaxsat.pipeline import estimate, prepare
+from jaxsat.pipeline import estimate
+from jaxsat.preparation import prepare
 from jaxsat.signals.readers import read
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.boards import Row, read_board, worse, write_board

@@ -29,7 +29,8 @@ from problems import OPTIONS, Batch, bars, direct, run_direct, strapdown_seconds
 
 from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.smoother import smooth_about
-from jaxsat.pipeline import _smooth, estimate, prepare
+from jaxsat.pipeline import _smooth, estimate
+from jaxsat.preparation import prepare
 from jaxsat.saturation.compensate import filter_trial
 from jaxsat.saturation.layout import gather
 from jaxsat.saturation.segment import condense, value_gradient_root
@@ -47,9 +48,7 @@ def objective_vs_strapdown() -> Iterator[Row]:
         filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
         at = batch.departure[0]
         state, covariance, _ = jax.tree.map(lambda x: x[at], filtered)
-        found, _ = gather(
-            trial, at, batch.arrival[0], state, covariance, batch.table(trial)[0], batch.sizes
-        )
+        found, _ = gather(trial, at, batch.arrival[0], state, covariance, batch.table(trial)[0], batch.sizes)
         return condense(found)
 
     condensed = jax.jit(jax.vmap(segment))(jax.tree.map(jnp.asarray, batch.trials))

@@ -12,7 +12,8 @@ from peers.strapdown import bare_trials, numba_strapdown
 
 from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.strapdown import Samples
-from jaxsat.pipeline import prepare, search_options
+from jaxsat.pipeline import search_options
+from jaxsat.preparation import prepare
 from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.compensate import filter_trial, solve_segments
 from jaxsat.saturation.layout import Sizes, Trial, padded_sizes

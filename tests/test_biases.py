@@ -19,7 +19,7 @@ from jaxsat.inertial.strapdown import (
     sample_intervals,
     sample_noise,
 )
-from jaxsat.pipeline import prepare
+from jaxsat.preparation import prepare
 from jaxsat.studies.motions import Walk
 from jaxsat.studies.simulate import Sensor, simulate
 

@@ -14,7 +14,14 @@ from corruptions import CORRUPTIONS
 
 from jaxsat.cli import main
 
-FILES = {"trajectory.parquet", "signals.parquet", "gaps.parquet", "segments.parquet", "summary.json", "report.html"}
+FILES = {
+    "trajectory.parquet",
+    "signals.parquet",
+    "gaps.parquet",
+    "segments.parquet",
+    "summary.json",
+    "report.html",
+}
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxsat import Sensor, estimate, load_config, simulate
-from jaxsat.pipeline import prepare
+from jaxsat.preparation import prepare
 from jaxsat.studies.motions import Walk
 
 CONFIG = load_config(None, method="standard")

@@ -12,6 +12,7 @@ ORDER = (
     "inertial",
     "saturation",
     "config",
+    "preparation",
     "pipeline",
     "attitude",
     "periodic",

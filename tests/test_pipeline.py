@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
-from jaxsat.pipeline import LATEST_FIRST_REST, estimate
+from jaxsat.pipeline import estimate
+from jaxsat.preparation import LATEST_FIRST_REST
 from jaxsat.present.tables import gaps_table
 from jaxsat.saturation import compensate
 from jaxsat.saturation.compensate import signal_prior
@@ -261,7 +262,7 @@ def test_a_start_in_motion_takes_its_attitude_from_a_later_rest(offset_sd, monke
     rest[:first] = False
     assert first * recording.period > LATEST_FIRST_REST
     moving = eqx.tree_at(lambda r: r.rest, recording, rest)
-    monkeypatch.setattr("jaxsat.pipeline.LEFT_OFFSET_SD", offset_sd)
+    monkeypatch.setattr("jaxsat.preparation.LEFT_OFFSET_SD", offset_sd)
     given = {"rails.gyr": "none", "rails.acc": "none"}
     found = estimate(moving, load_config(None, method="standard", **given)).trajectory
     turn, true = (Rotation.from_quat(q[0], scalar_first=True).inv() for q in (found.q_nb, truth.q_nb))

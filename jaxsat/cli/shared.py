@@ -97,13 +97,16 @@ def limit(name: str, text: str, words: str) -> float:
 
 
 def use_compilation_cache() -> None:
-    """Compiled programs are kept between runs, in the user's cache unless JAX was told another place."""
+    """Programs and their traces are kept between runs, in the user's cache unless JAX was told another place."""
     import jax
+
+    from jaxsat.inertial.programs import keep_traces
 
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(base / "jaxsat"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    keep_traces(Path(jax.config.jax_compilation_cache_dir) / "traces")  # type: ignore[attr-defined]
 
 
 def tell(text: str, warnings: list[str], quiet: bool, strict: bool) -> None:

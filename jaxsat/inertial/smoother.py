@@ -131,7 +131,8 @@ def closed_loop(
 
     intervals = sample_intervals(samples.signal, samples.period)
     last, (corrected, cost) = jax.lax.scan(step, (prior, part(prior_covariance)), (intervals, samples, rows))
-    return Filtered(*jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last), cost)
+    state, covariance = jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), corrected, last)
+    return Filtered(state, covariance, cost)
 
 
 def linearised(

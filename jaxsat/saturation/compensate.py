@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.biases import estimate_biases
+from jaxsat.inertial.programs import stored_jit
 from jaxsat.inertial.smoother import Filtered, closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
@@ -119,9 +120,7 @@ class Fills(eqx.Module):
         )
 
 
-def filter_trial(
-    trial: Trial, signal: Float[Arrays, "N 6"], extra: Float[Arrays, "N 6"]
-) -> Filtered:
+def filter_trial(trial: Trial, signal: Float[Arrays, "N 6"], extra: Float[Arrays, "N 6"]) -> Filtered:
     """The departures of all segments: one filter pass over the recording with a filled signal.
 
     extra: variance beyond the sensor's. With that of filled values departures know how uncertain their tilt is, and
@@ -178,13 +177,13 @@ def trial_biases(
     )
 
 
-_bias = eqx.filter_jit(trial_biases)
-filter_recording = eqx.filter_jit(filter_trial)
-_solve = eqx.filter_jit(solve_segments)
-_prior = eqx.filter_jit(signal_prior)
+_bias = stored_jit(trial_biases)
+filter_recording = stored_jit(filter_trial)
+_solve = stored_jit(solve_segments)
+_prior = stored_jit(signal_prior)
 
 
-@eqx.filter_jit
+@stored_jit
 def _arrivals(trial: Trial, start, end, longest):
     return arrivals(Samples(trial.signal, trial.period, trial.variance), trial.rows, start, end, longest)
 

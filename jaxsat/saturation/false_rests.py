@@ -1,9 +1,9 @@
 """Rests that cannot be: a zero velocity in the middle of a motion.
 
 A detector that takes a smooth part of a swing for a rest, or a wrong flag in the recording, bends the path and makes
-fills explain a velocity that was not zero. Such a rest contradicts the motion before it and the motion after it alike,
-so leaving it out makes the next rest fit: the cost J* of both motions falls by thousands. A wrong rate does not, since
-the next rest contradicts it as well. What saturates may be anything within its bounds here.
+fills explain a velocity that was not zero. Such a rest contradicts the motions before and after it alike, so leaving
+it out makes the next rest fit: the cost J* of both motions falls by thousands. A wrong rate does not: the next rest
+contradicts it as well. What saturates may be anything within its bounds here.
 """
 
 import jax
@@ -25,14 +25,12 @@ MOST_LEFT = 0.1
 GLANCE = 0.2
 
 
-def false_rests(
-    trial: Trial, segments: Segments, filtered: Filtered
-) -> Bool[np.ndarray, "S"]:
+def false_rests(trial: Trial, segments: Segments, filtered: Filtered) -> Bool[np.ndarray, "S"]:
     """Whether the rest that follows each segment is false.
 
     filtered: the trial's, saturated values being free within their bounds. The first rest and the last are not
-    judged. A false rest contradicts its neighbours, so they contradict it: of neighbours only the worst is found, what
-    it did to the others being seen once it is gone. The worst is the one that turns most while it is said to rest.
+    judged. A false rest contradicts its neighbours, so they contradict it: of neighbours only the worst is found,
+    what it did to the others being seen once it is gone; the worst is the one that turns most while it should rest.
     """
     glance = max(1, round(GLANCE / float(trial.period[0])))
     departure, arrival, end = segments.departure, segments.arrival, segments.rest_end

@@ -25,9 +25,9 @@ REACH = 0.1
 FEWEST = 100
 # Root mean square of what a gap lost (δ), in rails.
 WIDTH = 0.5
-# sd of what a gap lost, as a share of what the prior says that it lost; besides the sd that the prior claims, which rests
-# on the movement that is left being as lively as what was lost. On the walks of the list `clip`, clipped at 350, 250 and
-# 200 °/s, half of the gaps lost 30 to 100 % more or less than the prior alone says.
+# sd of what a gap lost, as a share of what the prior says that it lost; besides the sd that the prior claims, which
+# rests on the movement that is left being as lively as what was lost. On the walks of the list `clip`, clipped at
+# 350, 250 and 200 °/s, half of the gaps lost at least 30 to 100 % more or less than the prior alone says, by length.
 SHARE = 0.3
 # Lengths (samples) of the peaks that are hidden and filled, to see how far off the prior is; each twice the last.
 NODES = (1, 2, 4, 8, 16, 32, 64)

@@ -14,11 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsat.inertial.components import Cholesky, Matrix
 from jaxsat.inertial.dense import one_by_one, solve_positive
 
-with warnings.catch_warnings():
-    # jaxopt announces on import that it is no longer developed; it is the solver the project is built on.
-    warnings.simplefilter("ignore", DeprecationWarning)
-    import jaxopt
-
 
 class Status(enum.IntEnum):
     """How a search ended."""
@@ -95,6 +90,11 @@ def projected_gradient(linearise: Linearise, box: Box) -> Solution:
     about 1 in any direction: `jaxopt.ProjectedGradient` restarts its step at 1 and can stop far from the optimum
     otherwise. Whether it has arrived is decided by the residual of the solution, not by the solver's own step length.
     """
+    with warnings.catch_warnings():
+        # jaxopt announces on import that it is no longer developed; here, since loading it takes a second.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import jaxopt
+
     u, low, high = box.scaled()
     share = 1.0 / jnp.maximum(jnp.sum(box.upper > box.lower), 1).astype(u.dtype)
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsat.config import Config
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
-from jaxsat.pipeline import Prepared
+from jaxsat.preparation import Prepared
 from jaxsat.saturation.compensate import (
     arrival_table,
     filter_trial,

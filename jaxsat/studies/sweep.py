@@ -17,7 +17,8 @@ from jaxtyping import Float, Int
 
 from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
-from jaxsat.pipeline import Prepared, prepare, search_options
+from jaxsat.pipeline import search_options
+from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording

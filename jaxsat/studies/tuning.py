@@ -29,7 +29,7 @@ from jaxsat.inertial.strapdown import (
     sample_intervals,
     sample_noise,
 )
-from jaxsat.pipeline import prepare
+from jaxsat.preparation import prepare
 from jaxsat.saturation.layout import Trial, pad
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.metrics import Track

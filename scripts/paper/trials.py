@@ -14,7 +14,8 @@ import pandas as pd
 from jaxtyping import Float
 
 from jaxsat.config import Config
-from jaxsat.pipeline import Estimate, Prepared, estimate, prepare, search_options
+from jaxsat.pipeline import Estimate, estimate, search_options
+from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording

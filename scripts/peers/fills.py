@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from jaxsat.pipeline import Prepared
+from jaxsat.preparation import Prepared
 from jaxsat.signals.recording import Recording
 
 Channel = Float[np.ndarray, "N"]

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from jaxsat.pipeline import Prepared
+from jaxsat.preparation import Prepared
 from jaxsat.signals.recording import CHANNELS, Recording
 
 from . import import_peer

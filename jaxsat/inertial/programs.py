@@ -1,0 +1,114 @@
+"""Compiled functions whose traces outlive the process.
+
+JAX keeps compiled programs on disk, but to know which one it needs it traces the Python code anew in each process:
+most of what a later run of the command line would wait for. `stored_jit` keeps the traces too.
+"""
+
+import hashlib
+import pickle
+import platform
+import tempfile
+from collections.abc import Callable
+from functools import cache, wraps
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_folder: Path | None = None
+_loaded: dict[str, Callable[..., Any]] = {}
+
+
+def keep_traces(folder: Path | None) -> None:
+    """From now on traces are read from and written to this folder; None: to none, as it is at first."""
+    global _folder
+    _folder = folder
+
+
+def stored_jit(function: F) -> F:
+    """`equinox.filter_jit` of a function of positional arguments that returns arrays; its trace is kept.
+
+    A trace is for the code of the package, the versions of what it runs on, the kind of device, and the arguments'
+    shapes, types and whatever is no array. One that cannot be read or written is made anew.
+    """
+    jitted = eqx.filter_jit(function)
+
+    @wraps(function)
+    def call(*args):
+        arrays, rest = eqx.partition(args, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic))
+        leaves, structure = jax.tree.flatten(arrays)
+        if _folder is None or any(isinstance(leaf, Tracer) for leaf in leaves):
+            return jitted(*args)
+        kinds = [jax.typeof(leaf) for leaf in leaves]
+        name = f"{function.__module__}.{function.__qualname__}"
+        parts = name, _surroundings(), jax.config.jax_enable_x64, structure, rest, kinds  # type: ignore[attr-defined]
+        key = hashlib.sha256(repr(parts).encode()).hexdigest()
+        if key not in _loaded:
+            path = _folder / f"{key}.trace"
+            program = _read(path)
+            if program is None:
+                whole = lambda *given: function(*eqx.combine(jax.tree.unflatten(structure, given), rest))  # noqa: E731
+                program = _trace(whole, kinds, path)
+            _loaded[key] = program
+        return _loaded[key](*leaves)
+
+    return call  # type: ignore[return-value]
+
+
+@cache
+def _surroundings() -> str:
+    """What a trace depends on besides its arguments."""
+    code, package = hashlib.sha256(), Path(__file__).parents[1]
+    for path in sorted(package.rglob("*.py")):
+        code.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+    packages = ("jax", "jaxlib", "equinox", "numpy", "optax", "jaxopt")
+    versions = [f"{name} {version(name)}" for name in packages]
+    return " ".join([code.hexdigest(), platform.python_version(), jax.default_backend(), *versions])
+
+
+def _program(exported: Any, skeleton: Any) -> Callable[..., Any]:
+    """A callable of a trace: of the leaves of its arguments, returning the tree that the function does."""
+    run, structure = jax.jit(exported.call), jax.tree.structure(skeleton)
+    return lambda *leaves: jax.tree.unflatten(structure, run(*leaves))
+
+
+def _read(path: Path) -> Callable[..., Any] | None:
+    from jax import export
+
+    try:
+        serialised, skeleton = pickle.loads(path.read_bytes())
+        return _program(export.deserialize(serialised), skeleton)
+    # Whatever is wrong with it, a trace can be made anew.
+    except Exception:
+        return None
+
+
+def _trace(function: Callable[..., Any], kinds: list[Any], path: Path) -> Callable[..., Any]:
+    from jax import export
+
+    structure = None
+
+    def flat(*leaves):
+        nonlocal structure
+        found, structure = jax.tree.flatten(function(*leaves))
+        return found
+
+    shapes = [jax.ShapeDtypeStruct(kind.shape, kind.dtype) for kind in kinds]
+    exported = export.export(jax.jit(flat))(*shapes)
+    assert structure is not None, "it was traced"
+    skeleton = jax.tree.unflatten(structure, list(range(structure.num_leaves)))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Whole or not at all, also where several processes share the folder.
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(pickle.dumps((exported.serialize(), skeleton)))
+        Path(file.name).replace(path)
+    except OSError:
+        pass
+    return _program(exported, skeleton)

@@ -1,0 +1,186 @@
+"""From a recording to a trial: what saturates, what rests, where it starts, and what is known of its noise."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsat.config import Config
+from jaxsat.errors import InputError
+from jaxsat.inertial.orientation import Gains, Start, backward
+from jaxsat.inertial.programs import stored_jit
+from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
+from jaxsat.inertial.smoother import Filtered, Rows
+from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
+from jaxsat.saturation.compensate import filter_recording
+from jaxsat.saturation.false_rests import false_rests
+from jaxsat.saturation.layout import Trial
+from jaxsat.signals.checks import check
+from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
+from jaxsat.signals.recording import Recording
+from jaxsat.signals.rests import Segments, find_rests, find_segments
+from jaxsat.signals.support import find_support
+
+# Up to so long before its first rest (s) a recording's tilt is as well known as in it.
+LATEST_FIRST_REST = 1.0
+# A gyroscope offset is taken from a first rest of at least this length; a shorter one tells less than it costs.
+SHORTEST_OFFSET_REST = 1.0
+# sd of the unknown velocity of a sensor that does not start at rest (m/s), and of its tilt (rad), however long it
+# moves before its first rest: a round number above the PI controller's inclination errors in results/orientation.
+MOVING_START_SD = 3.0
+MOVING_START_TILT_SD = 0.05
+# sd of the gyroscope offset that is left while a rate is integrated back from the first rest (rad/s).
+LEFT_OFFSET_SD = 1e-3
+
+
+class Prepared(eqx.Module):
+    """A recording with its rests, rails and gaps found, ready for the smoother."""
+
+    trial: Trial
+    """Padded."""
+    gyr_offset: Float[np.ndarray, "3"]
+    """What was taken off the rates (rad/s)."""
+    rails: Rails
+    rest: Bool[np.ndarray, "N"]
+    segments: Segments
+    gaps: Gaps
+    sign: Int[np.ndarray, "N 6"]
+    warnings: list[str] = eqx.field(static=True)
+
+
+def prepare(recording: Recording, config: Config) -> Prepared:
+    """All that is done to a recording before it is smoothed; raises `InputError` as `estimate` does."""
+    with jax.enable_x64(True):
+        return prepare_and_filter(recording, config)[0]
+
+
+def prepare_and_filter(recording: Recording, config: Config) -> tuple[Prepared, Filtered]:
+    """And the filter pass over it, saturated values being free within their bounds."""
+    warnings = check(recording)
+    rails = find_rails(recording, config.rails.gyr, config.rails.acc)
+    saturated, sign = saturation_mask(recording, rails)
+    at_rail = np.any(saturated, axis=1)
+    rest = find_rests(
+        recording,
+        config.rests.detector,
+        config.rests.threshold,
+        config.rests.window,
+        config.rests.min_duration,
+        at_rail,
+    )
+    rest = rest & ~at_rail & ~recording.missing.all(axis=1)
+    while True:
+        trial, offset = _trial(recording, config, rest, sign)
+        segments, searched = find_segments(rest), without_floor(trial, config)
+        filtered = filter_recording(searched, trial.signal, trial.unfilled_variance)
+        false = false_rests(searched, segments, filtered)
+        if not false.any():
+            break
+        for start, end in zip(segments.arrival[false], segments.rest_end[false], strict=True):
+            rest[start:end] = False
+            warnings.append(
+                f"the rest from {recording.time[start]:.2f} to {recording.time[end]:.2f} s is left out: the motions "
+                "before and after it say that the sensor moved."
+            )
+    return Prepared(trial, offset, rails, rest, segments, find_gaps(sign), sign, warnings), filtered
+
+
+def without_floor(trial: Trial, config: Config) -> Trial:
+    """An inequality acts on the whole trajectory only: a single segment is searched without it."""
+    if config.height.mode == "nonnegative":
+        return eqx.tree_at(lambda t: t.rows.height, trial, None)
+    return trial
+
+
+def _trial(
+    recording: Recording, config: Config, rest: Bool[np.ndarray, "N"], sign: Int[np.ndarray, "N 6"]
+) -> tuple[Trial, Float[np.ndarray, "3"]]:
+    """The recording as the smoother wants it, and the gyroscope offset that was taken off (rad/s)."""
+    n, T, signal = len(recording), recording.period, recording.signal
+    started = np.flatnonzero(rest)
+    if not len(started):
+        raise InputError(
+            f"{recording.name}: no rest is found, and without any a trajectory drifts away within seconds; give a "
+            f"rest column if the sensor does rest. As it is, {find_support(recording, rest).sentence()}."
+        )
+    first = int(started[0])
+    moving = np.flatnonzero(~rest[first:])
+    first_rest = slice(first, first + int(moving[0]) if len(moving) else n)
+    length = first_rest.stop - first_rest.start
+    # The first rest at a foot's first step includes its first stir: leave out its last tenth of a second.
+    quiet = slice(first, max(first + 1, first_rest.stop - round(0.1 / T)))
+
+    offset = np.zeros(3)
+    if config.smoother.gyr_offset == "first_rest" and length * T >= SHORTEST_OFFSET_REST:
+        offset = signal[quiet, :3].mean(axis=0)
+    signal = signal - np.concatenate([offset, np.zeros(3)])
+    up = signal[quiet, 3:].mean(axis=0)
+    gravity = np.linalg.norm(up) if config.gravity == "auto" else float(config.gravity)
+
+    # Density to per-sample variance; a value that was not measured may be anything the channel did.
+    noise, limits = config.noise, config.saturation
+    density = np.repeat([noise.gyr_density, noise.acc_density], 3)
+    variance = np.where(recording.missing, np.maximum(signal.var(axis=0), density**2 / T), density**2 / T)
+
+    # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
+    # controller of `orientation` where that is so long that its offset would do more than the controller errs.
+    q_nb = quat_between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
+    velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
+    drifted = (LEFT_OFFSET_SD * first * T) ** 2 + noise.gyr_density**2 * first * T
+    if first * T > LATEST_FIRST_REST:
+        tilt += min(drifted, MOVING_START_TILT_SD**2)
+    if drifted > MOVING_START_TILT_SD**2:
+        trusted = ((sign[:first] == 0) & ~recording.missing[:first]).reshape(first, 2, 3).all(axis=2)
+        start = Start(q_nb, jnp.zeros(3), jnp.asarray(float(gravity)))
+        q_nb = _attitude_before(signal[:first], trusted, T, start, config)
+    elif first > 0:
+        early = prefixes(sample_intervals(jnp.asarray(signal[:first]), jnp.full(first, T)))
+        q_nb = quat_multiply(q_nb, quat_conjugate(early.rotation[-1]))
+    speed = MOVING_START_SD**2 if first > 0 else noise.rest_velocity_sd**2
+    # Tilt is horizontal in the navigation frame; heading and position are the origin of the map.
+    prior_covariance = np.diag([tilt, tilt, 0.0, 0.0, 0.0, 0.0, speed, speed, speed])
+
+    height = None
+    if config.height.mode != "off":
+        height = np.zeros(n, bool)
+        arrivals = np.flatnonzero(rest[1:] & ~rest[:-1]) + 1
+        height[arrivals[arrivals > first]] = True
+    rows = Rows(
+        rest=jnp.asarray(rest),
+        velocity_variance=jnp.full(n, noise.rest_velocity_sd**2),
+        height=None if height is None else jnp.asarray(height),
+        height_variance=jnp.full(n, config.height.sd**2),
+    )
+    trial = Trial(
+        signal=signal,
+        period=np.full(n, T),
+        variance=variance,
+        sign=sign,
+        clean=(sign == 0) & ~recording.missing,
+        bound=np.repeat([limits.gyr_bound, limits.acc_bound], 3),
+        rows=rows,
+        prior=jax.tree.map(np.asarray, NavState(q_nb, velocity, jnp.zeros(3))),
+        prior_covariance=prior_covariance,
+        gravity=np.asarray(gravity),
+    )
+    return trial.padded(), offset
+
+
+def _attitude_before(signal, trusted, period: float, rest: Start, config: Config) -> Float[Array, "4"]:
+    """Attitude at the first of the samples before a rest."""
+    # Blank samples before the first turn nothing; lengths that are about the same share a program.
+    blank = ((-len(signal) % 4096, 0), (0, 0))
+    periods = jnp.asarray(np.pad(np.full(len(signal), period), blank[0]))
+    values, trusted = jnp.asarray(np.pad(signal, blank)), jnp.asarray(np.pad(trusted, blank))
+    return _backward(values, periods, trusted, rest, given_gains(config)).q_nb[0]
+
+
+_backward = stored_jit(backward)
+
+
+def given_gains(config: Config) -> Gains:
+    """The gains of `config.orientation`, as numbers of JAX."""
+    s = config.orientation
+    gate = np.inf if s.gate == "none" else s.gate
+    return Gains(*(jnp.asarray(x, float) for x in (s.kp, s.ki, s.tau, gate, s.limit)))

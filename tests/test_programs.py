@@ -1,0 +1,97 @@
+"""Traces that are kept: the same results without running the Python code again, and never a wrong one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsat.inertial import programs
+from jaxsat.inertial.programs import keep_traces, stored_jit
+
+TRACED = []
+
+
+class Pair(eqx.Module):
+    value: jax.Array
+    name: str = eqx.field(static=True)
+    nothing: None = None
+
+
+def scaled(pair: Pair, factor, power: int):
+    TRACED.append((pair.name, power))
+    matrix = jnp.eye(3, dtype=pair.value.dtype) + jnp.outer(pair.value, pair.value)
+    return Pair(jnp.linalg.cholesky(matrix)[:, 0] * factor**power, pair.name + "!"), {
+        "sum": jnp.sum(pair.value)
+    }
+
+
+@pytest.fixture
+def folder(tmp_path):
+    TRACED.clear()
+    keep_traces(tmp_path / "traces")
+    yield tmp_path / "traces"
+    keep_traces(None)
+    programs._loaded.clear()
+
+
+def fresh():
+    """The function as a new process has it."""
+    programs._loaded.clear()
+    return stored_jit(scaled)
+
+
+PAIR = Pair(jnp.array([1.0, 2.0, 3.0]), "a")
+
+
+def check(found, factor=2.0, power=3):
+    first, second = found
+    matrix = np.eye(3) + np.outer(PAIR.value, PAIR.value)
+    np.testing.assert_allclose(first.value, np.linalg.cholesky(matrix)[:, 0] * factor**power)
+    assert first.name == "a!" and first.nothing is None and second["sum"] == 6.0
+
+
+def test_a_later_process_does_not_trace(folder):
+    for _ in range(3):
+        check(fresh()(PAIR, np.asarray(2.0), 3))
+    assert TRACED == [("a", 3)] and len(list(folder.iterdir())) == 1
+
+
+def test_what_is_no_array_and_shapes_and_types_have_traces_of_their_own(folder):
+    run = fresh()
+    check(run(PAIR, np.asarray(2.0), 3))
+    check(run(PAIR, np.asarray(2.0), 2), power=2)
+    assert run(Pair(PAIR.value, "b"), np.asarray(2.0), 3)[0].name == "b!"
+    run(PAIR, np.asarray([2.0]), 3)
+    run(Pair(PAIR.value.astype(jnp.float32), "a"), np.asarray(2.0, np.float32), 3)
+    assert len(TRACED) == 5 == len(list(folder.iterdir()))
+
+
+def test_other_code_has_a_trace_of_its_own(folder, monkeypatch):
+    fresh()(PAIR, np.asarray(2.0), 3)
+    monkeypatch.setattr(programs, "_surroundings", lambda: "another version")
+    fresh()(PAIR, np.asarray(2.0), 3)
+    assert len(TRACED) == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"no trace", None])
+def test_a_spoilt_trace_is_made_anew(folder, content):
+    fresh()(PAIR, np.asarray(2.0), 3)
+    (path,) = folder.iterdir()
+    path.write_bytes(path.read_bytes()[:-40] if content is None else content)
+    for _ in range(2):
+        check(fresh()(PAIR, np.asarray(2.0), 3))
+    assert len(TRACED) == 2
+
+
+def test_a_folder_that_cannot_be_written_costs_a_trace_only(folder):
+    folder.parent.joinpath("file").write_text("")
+    keep_traces(folder.parent / "file" / "traces")
+    check(fresh()(PAIR, np.asarray(2.0), 3))
+
+
+def test_inside_another_program_it_is_the_function(folder):
+    run = fresh()
+    found = jax.vmap(lambda value: run(Pair(value, "a"), jnp.asarray(2.0), 3)[1]["sum"])(jnp.ones((4, 3)))
+    np.testing.assert_allclose(found, 3.0)
+    assert not folder.exists()
