@@ -4,10 +4,11 @@
 
 Parts: `pyshoe` (really saturated, against Vicon, rests as given), `clipped` (PyShoe walks that do not saturate,
 clipped at 350, 250 and 200 °/s), `gaitmap` (a walk against motion capture), `openshoe` and `xio` (against their own
-unclipped path). But for PyShoe, rests are found in the clipped recording itself; nothing is told of its rails.
+unclipped path), `intervals` (how often those of `map` hold what was clipped off).
+But for PyShoe, rests are found in the clipped recording itself; nothing is told of its rails.
 Peers: fills (`peers/fills.py`) see the same saturated samples and rests; gaitmap's RtsKalman, on the recording as
 measured and filled by the spline, takes part in `gaitmap` where it is installed. Writes board.json, env.json,
-trials.csv and figures; what was not run again keeps its rows.
+trials.csv, intervals.csv and figures; what was not run again keeps its rows.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import accuracy_intervals
 import numpy as np
 import pandas as pd
 from accuracy_figures import draw_ratios, draw_trial
@@ -249,6 +251,25 @@ PARTS = {
 }
 
 
+def intervals(data: Path) -> pd.DataFrame:
+    """Walks clipped in software, by `map`: what each interval should have held is known."""
+    recordings = {
+        name: (read(data / "pyshoe" / f"{name}.mat", rest_column="zv_shoe_opt"), 250)
+        for name in tomllib.loads((data / "pyshoe" / "splits.toml").read_text())["clip"]
+    }
+    for side in ("left", "right"):
+        walk = read(data / "gaitmap" / "imu_sample_not_rotated.csv", sensor=f"{side}_sensor")
+        recordings[f"gaitmap {side}"] = walk, 300
+    recordings["xio"] = read(data / "xio" / "short_walk.csv"), 400
+    recordings["openshoe 44"] = read(data / "openshoe" / "Measurement_100521_44.npz"), 350
+    scores = []
+    for name, (recording, rail) in recordings.items():
+        found = estimate(clip(recording, gyr=rail), load_config(None, method="map"))
+        scores += accuracy_intervals.held(f"{name}, {rail} °/s", recording, found)
+        print("intervals", name, flush=True)
+    return accuracy_intervals.summary(pd.DataFrame(scores))
+
+
 def merged(before: pd.DataFrame, table: pd.DataFrame, parts: list[str], methods: list[str]) -> pd.DataFrame:
     """Former rows but those that were run again, or are of methods that are no longer run; then the new ones."""
     again = before["method"].isin(methods) | ~before["method"].isin(EVERY)
@@ -300,31 +321,36 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="The accuracy board")
     parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("results/accuracy"))
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--only", nargs="+", choices=[*PARTS, "intervals"], default=[*PARTS, "intervals"])
     parser.add_argument("--methods", nargs="+", choices=EVERY, help="default: every one that is installed")
     parser.add_argument("--gate", action="store_true", help="exit with 1 where something got worse")
     arguments = parser.parse_args()
     path, trials = arguments.output / "board.json", arguments.output / "trials.csv"
     former = read_board(path) if path.exists() else []
     methods = arguments.methods or installed()
-    found = []
-    for part in arguments.only:
+    found, parts = [], [part for part in arguments.only if part in PARTS]
+    for part in parts:
         here = tuple(m for m in methods if part == "gaitmap" or m not in RTS)
         found += PARTS[part](arguments.data, here)
     paths = {tuple(row[c] for c in KEY[1:]): row.pop("path") for row in found}
     table = pd.DataFrame(found).round(6)
     if trials.exists():
-        table = merged(pd.read_csv(trials), table, arguments.only, methods)
-    for part in arguments.only:
+        table = merged(pd.read_csv(trials), table, parts, methods) if parts else pd.read_csv(trials)
+    for part in parts:
         if "standard" not in set(table.loc[table["part"] == part, "method"]):
             raise InputError(f"{part}: there is no row of standard to compare with; add it to --methods.")
-    rows = {r.metric: r for r in former} | {r.metric: r for r in board(table, arguments.only)}
+    rows = {r.metric: r for r in former} | {r.metric: r for r in board(table, parts)}
+    held = intervals(arguments.data) if "intervals" in arguments.only else None
+    if held is not None:
+        rows |= {r.metric: r for r in accuracy_intervals.board(held)}
     sentences = worse(rows.values(), former, GATE_TOLERANCE) if arguments.gate else []
     for sentence in sentences:
         print(sentence, file=sys.stderr)
     if not sentences:
         arguments.output.mkdir(parents=True, exist_ok=True)
         table.to_csv(trials, index=False)
+        if held is not None:
+            held.to_csv(arguments.output / "intervals.csv", index=False, float_format="%.4g")
         write_board(path, rows.values(), load_config(None, method="map").model_dump())
         if "pyshoe" in arguments.only:
             draw(arguments.output, table, paths)

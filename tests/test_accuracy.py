@@ -1,10 +1,12 @@
 """The accuracy board's own parts: fills of its peers against what they minimise, and rows kept or replaced."""
 
+import dataclasses
 import importlib
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -90,3 +92,45 @@ def test_rows_that_were_run_again_replace_the_former_and_keep_their_place(board)
         ("xio", "a", "400", "map", 1.0),
         ("gaitmap", "left", "8 g", "forgotten", 4.0),
     ]
+
+
+def test_intervals_that_are_right_hold_their_share_and_others_do_not(board):
+    intervals = importlib.import_module("accuracy_intervals")
+    rng, rows = np.random.default_rng(4), []
+    for name, scale in (("a", 1.0), ("b", 1.0)):
+        for what in intervals.WHAT:
+            z = rng.normal(size=4000) * (3.0 if what == "peaks" else scale)
+            rows += [{"trial": name, "sensor": "gyr", "what": what, "z": value} for value in z]
+    table = intervals.summary(pd.DataFrame(rows))
+    assert len(table) == 6 and (table["count"] == 4000).all()
+    found = {row.metric: row for row in intervals.board(table)}
+    for what, right in (("samples", True), ("impulses", True), ("peaks", False)):
+        for share in (50, 90):
+            row = found[f"interval_{share}_{what}"]
+            assert (
+                row.goal == pytest.approx(0.05)
+                and (row.value < 0.02) is right
+                and (row.value > 0.2) is not right
+            )
+
+
+def test_what_a_gap_lost_is_compared_with_the_recording_before_it_was_clipped(board):
+    """The bar of the tests: its own numbers, from the estimate and the unclipped signal by hand."""
+    from jaxsat import Sensor, estimate, load_config, simulate
+    from jaxsat.studies.motions import Bar
+
+    intervals = importlib.import_module("accuracy_intervals")
+    whole, truth = simulate(Bar(), rate=100.0, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
+    whole = dataclasses.replace(whole, rest=truth.rest)
+    settings = {"saturation.gyr_bound": 5.0, "smoother.gyr_offset": "none"}
+    found = estimate(board.clip(whole, gyr=np.rad2deg(7.5)), load_config(None, **settings))
+    rows = pd.DataFrame(intervals.held("bar", whole, found)).set_index("what")
+    i, j = found.gaps.start[0], found.gaps.end[0]
+    filled, true = found.filled[i:j, 1], whole.gyr[i:j, 1]
+    samples = rows.loc["samples", "z"].to_numpy()
+    np.testing.assert_allclose(samples, (filled - true) / found.signal_sd[i:j, 1])
+    impulse = (filled - true).sum() / found.fills.gap_sd[i, 1]
+    assert rows.loc["impulses", "z"] == pytest.approx(impulse)
+    top = np.argmax(np.abs(filled))
+    peak = (filled[top] - true[np.argmax(np.abs(true))]) / found.signal_sd[i + top, 1]
+    assert rows.loc["peaks", "z"] == pytest.approx(peak) and len(rows) == j - i + 2
