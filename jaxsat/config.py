@@ -15,6 +15,9 @@ Method = Literal["standard", "direct", "triangle", "quadratic", "map"]
 RailSetting = Literal["auto", "none"] | float
 
 
+_Factor = Annotated[float, Field(gt=0)]
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -29,12 +32,21 @@ class Noise(_Section):
 
     gyr_density: float = Field(default=2e-3, gt=0, description="angular-rate noise density (rad/s/√Hz)")
     acc_density: float = Field(default=4e-3, gt=0, description="specific-force noise density (m/s²/√Hz)")
+    axes: tuple[_Factor, _Factor, _Factor, _Factor, _Factor, _Factor] = Field(
+        default=(1.0,) * 6, description="density of each channel, gyr_x to acc_z, over that of its sensor"
+    )
     rest_velocity_sd: float = Field(
         default=0.02, gt=0, description="sd of the velocity of a resting sensor (m/s)"
     )
     initial_tilt_sd: float = Field(
         default=0.005, gt=0, description="sd of the initial tilt, mostly accelerometer bias (rad)"
     )
+
+    @property
+    def densities(self) -> list[float]:
+        """Of the six channels (rad/s/√Hz, m/s²/√Hz)."""
+        sensors = [self.gyr_density] * 3 + [self.acc_density] * 3
+        return [density * factor for density, factor in zip(sensors, self.axes, strict=True)]
 
 
 class Rests(_Section):

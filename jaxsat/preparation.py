@@ -120,14 +120,14 @@ def _trial(
 
     # Density to per-sample variance; a value that was not measured may be anything the channel did.
     noise, limits = config.noise, config.saturation
-    density = np.repeat([noise.gyr_density, noise.acc_density], 3)
+    density = np.array(noise.densities)
     variance = np.where(recording.missing, np.maximum(signal.var(axis=0), density**2 / T), density**2 / T)
 
     # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
     # controller of `orientation` where that is so long that its offset would do more than the controller errs.
     q_nb = quat_between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
     velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
-    drifted = (LEFT_OFFSET_SD * first * T) ** 2 + noise.gyr_density**2 * first * T
+    drifted = (LEFT_OFFSET_SD * first * T) ** 2 + density[:3].max() ** 2 * first * T
     if first * T > LATEST_FIRST_REST:
         tilt += min(drifted, MOVING_START_TILT_SD**2)
     if drifted > MOVING_START_TILT_SD**2:

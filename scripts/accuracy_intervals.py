@@ -26,15 +26,15 @@ def held(name: str, recording: Recording, found: Estimate) -> Iterator[dict]:
     for z, which in zip(away, sensor, strict=True):
         yield {"trial": name, "sensor": ("gyr", "acc")[which], "what": "samples", "z": z}
     clipped, time = found.recording.signal, recording.time
-    for gap in gaps_table(found).dropna(subset=["peak_sd"]).itertuples():
-        channel = CHANNELS.index(str(gap.channel))
-        inside = slice(*np.searchsorted(time, np.array([gap.start, gap.end]) - 0.5 * recording.period))
+    for gap in gaps_table(found).dropna(subset=["peak_sd"]).to_dict("records"):
+        channel = CHANNELS.index(gap["channel"])
+        inside = slice(*np.searchsorted(time, np.array([gap["start"], gap["end"]]) - 0.5 * recording.period))
         true = truth[inside, channel]
         peak = true[np.argmax(np.abs(true))]
         impulse = np.sum(true - clipped[inside, channel]) * recording.period
         one = {"trial": name, "sensor": ("gyr", "acc")[channel // 3]}
-        yield {**one, "what": "peaks", "z": (gap.peak - peak) / gap.peak_sd}
-        yield {**one, "what": "impulses", "z": (gap.impulse - impulse) / gap.impulse_sd}
+        yield {**one, "what": "peaks", "z": (gap["peak"] - peak) / gap["peak_sd"]}
+        yield {**one, "what": "impulses", "z": (gap["impulse"] - impulse) / gap["impulse_sd"]}
 
 
 def summary(scores: pd.DataFrame) -> pd.DataFrame:

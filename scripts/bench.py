@@ -5,7 +5,8 @@
 Compilation is apart, times are the shortest of several repeats. 256 trials × 512 samples, 32 saturated gyroscope
 samples each, float64, unless a row says otherwise. `--gate` exits with 1 where a value is worse than the board
 that is there by more than half. `--only` keeps the other rows of that board. `--small` is for a quick look: the
-sweep with a tenth of its trials. Peers come with `pip install 'jaxsat[bench]'`.
+sweep with a tenth of its trials. Peers come with `pip install 'jaxsat[bench]'`. `solvers` needs the PyShoe recordings
+in ../shared/data.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -34,6 +36,8 @@ from jaxsat.preparation import prepare
 from jaxsat.saturation.compensate import filter_trial
 from jaxsat.saturation.layout import gather
 from jaxsat.saturation.segment import condense, value_gradient_root
+from jaxsat.saturation.solvers import Status
+from jaxsat.signals.readers import read
 from jaxsat.studies.boards import Row, read_board, worse, write_board
 from jaxsat.studies.motions import Bar
 from jaxsat.studies.simulate import GRAVITY, write_simulation
@@ -93,6 +97,41 @@ def estimate_vs_smoother() -> Iterator[Row]:
     yield Row(
         "estimate_vs_smoother", seconds / smoother, "1", "lower", 3, None,
         f"{len(recording)} samples, {busy} segments that saturate: {seconds:.3f} s over {smoother:.3f} s",
+    )  # fmt: skip
+
+
+def solvers() -> Iterator[Row]:
+    """Both solvers on each segment of the recordings that really saturated, from the same departures."""
+    folder = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyshoe"
+    if not folder.is_dir():
+        print(f"solvers: left out, there are no recordings at {folder}")
+        return
+    settings = {"method": "direct", "saturation.sweeps": 1, "saturation.tolerance": 1e-4}
+    unlike, notes, settled, segments = 0.0, [], 0, 0
+    for name in tomllib.loads((folder / "splits.toml").read_text())["saturated"]:
+        recording = read(folder / f"{name}.mat", rest_column="zv_shoe_opt")
+        found, seconds = {}, {}
+        for solver, most in (("gauss_newton", 1000), ("projected_gradient", 5000)):
+            chosen = {"saturation.solver": solver, "saturation.max_iterations": most}
+            config = load_config(None, **settings, **chosen)
+            found[solver] = estimate(recording, config).fills
+            seconds[solver] = estimate(recording, config).seconds["compensation"]
+        newton, gradient = found.values()
+        # One that gave up says so; what both call a minimum is compared.
+        both = (newton.status == Status.CONVERGED) & (gradient.status == Status.CONVERGED)
+        busy = newton.status != Status.NOTHING_TO_DO
+        settled, segments = settled + int(both.sum()), segments + int(busy.sum())
+        difference = np.abs(newton.cost_after - gradient.cost_after)[both] / (1.0 + newton.cost_after[both])
+        unlike = max(unlike, float(difference.max(initial=0.0)))
+        notes.append(
+            f"{name} {newton.iterations.max()} and {gradient.iterations.max()} steps at most, "
+            f"{seconds['gauss_newton']:.1f} and {seconds['projected_gradient']:.1f} s, {both.sum()} of {busy.sum()}"
+        )
+        print(notes[-1], f"{difference.max(initial=0.0):.1e}", flush=True)
+    yield Row(
+        "same_cost", unlike, "1", "lower", 1e-6, None,
+        f"largest difference of J* / (1 + J*), method 1, tolerance 1e-4, {settled} of {segments} segments in which "
+        "both solvers settle; Gauss-Newton and projected gradient by trial: " + "; ".join(notes),
     )  # fmt: skip
 
 
@@ -281,6 +320,7 @@ PARTS: dict[str, Callable[..., Iterator[Row]]] = {
     "objective": objective_vs_strapdown,
     "direct": direct_vs_strapdown,
     "estimate": estimate_vs_smoother,
+    "solvers": solvers,
     "paper": paper_way_speedup,
     "smoother": smoother_vs_peers,
     "amortisation": batch_amortisation,

@@ -129,7 +129,8 @@ def test_section_5_both_orders_agree_on_one_segment(run):
 @pytest.mark.slow
 def test_intervals_are_counted(run):
     table = run("coverage")
-    assert table[["fill", "end"]].to_numpy().max() <= 1.0 and table["sd_median"].min() > 0.0
+    shares = table[[f"{what}_{share}" for what in ("fill", "peak", "end") for share in (50, 90)]].to_numpy()
+    assert shares.min() >= 0.0 and shares.max() <= 1.0 and table["sd_median"].min() > 0.0
 
 
 @pytest.mark.slow

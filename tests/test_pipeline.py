@@ -271,3 +271,16 @@ def test_a_start_in_motion_takes_its_attitude_from_a_later_rest(offset_sd, monke
     assert tilt < 0.02 and tilt < 3 * np.hypot(*sd[:2]) < 0.25
     way = turn.apply(found.position[first] - found.position[0])
     assert np.linalg.norm(way - true.apply(truth.position[first] - truth.position[0])) < 0.1
+
+
+def test_an_axis_may_be_noisier_than_its_sensor():
+    """Gyroscope y trusted less by a factor: as if all three were, where only it turns the sensor."""
+    recording, _ = bar(0, gyr_rail=7.5)
+    axes = {"noise.axes": [1.0, 5.0, 1.0, 1.0, 1.0, 1.0]}
+    found, plain = (estimate(recording, load_config(None, method="standard", **BAR, **x)) for x in (axes, {}))
+    np.testing.assert_allclose(found.signal_sd / plain.signal_sd, np.tile([1, 5, 1, 1, 1, 1.0], (160, 1)))
+    assert found.cost < plain.cost
+    with pytest.raises(InputError, match=r"noise\.axes"):
+        load_config(None, **{"noise.axes": [1.0, 2.0, 3.0]})
+    with pytest.raises(InputError, match=r"noise\.axes"):
+        load_config(None, **{"noise.axes": [1.0, 2.0, 3.0, 1.0, 0.0, 1.0]})

@@ -72,15 +72,17 @@ def walk():
 def test_the_misfit_is_that_of_one_dense_gaussian():
     """Still but for noise, where the filter is linear: −log p of all velocities of the rests at once."""
     n, rng = 60, np.random.default_rng(0)
-    noise = Noise(gyr_density=3e-5, acc_density=2e-4, rest_velocity_sd=1e-4, initial_tilt_sd=1e-5)
+    axes = (1.0, 2.0, 0.5, 1.0, 3.0, 1.0)
+    noise = Noise(gyr_density=3e-5, acc_density=2e-4, axes=axes, rest_velocity_sd=1e-4, initial_tilt_sd=1e-5)
     rest = np.ones(n, bool)
     rest[10:30] = rest[40:55] = False
-    sd = np.repeat([noise.gyr_density, noise.acc_density], 3) * np.sqrt(RATE)
+    sd = np.array(noise.densities) * np.sqrt(RATE)
     signal = [0.0, 0.0, 0.0, 0.0, 0.0, G] + sd * rng.normal(size=(n, 6))
     time, missing = np.arange(n) / RATE, np.zeros((n, 6), bool)
     recording = Recording(time, signal[:, :3], signal[:, 3:], missing, rest)
     trial = noise_trial(recording, Config(noise=noise, gravity=G))
     samples, _, prior, covariance, gravity = trial.problem(of(noise))
+    np.testing.assert_allclose(samples.variance[:n], np.repeat(sd[None] ** 2, n, axis=0))
     reference = strapdown(samples.signal, samples.period, prior, gravity)
     at = reference.q_nb[:-1]
     transitions = jax.vmap(error_transition)(at, sample_intervals(samples.signal, samples.period))

@@ -103,6 +103,8 @@ class NoiseTrial(eqx.Module):
     trial: Trial
     measured: Bool[np.ndarray, "N 6"]
     """The variance of the value is that of the sensor's density."""
+    axes: Float[np.ndarray, "6"]
+    """Density of each channel over that of its sensor."""
     at_rest: Bool[np.ndarray, ""]
     """The recording starts at rest."""
     relinearisations: Int[np.ndarray, ""]
@@ -114,7 +116,7 @@ class NoiseTrial(eqx.Module):
     def problem(self, noise: Float[Array, "3"]) -> tuple[Samples, Rows, NavState, Float[Array, "9 9"], Array]:
         """What the smoother is asked with this noise: gyr_density, acc_density, rest_velocity_sd."""
         trial = jax.tree.map(jnp.asarray, self.trial)
-        density = jnp.repeat(noise[:2], 3)
+        density = jnp.repeat(noise[:2], 3) * self.axes
         held = jnp.where(trial.period > 0.0, trial.period, 1.0)
         variance = jnp.where(self.measured, density[None] ** 2 / held[:, None], trial.variance)
         still = jnp.full_like(trial.period, noise[2] ** 2)
@@ -139,7 +141,7 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
     with jax.enable_x64(True):
         prepared = prepare(recording, config)
     n, size = len(recording), len(prepared.trial.signal)
-    density = np.repeat([config.noise.gyr_density, config.noise.acc_density], 3)
+    density = np.array(config.noise.densities)
     plain = np.isclose(prepared.trial.variance[:n], density**2 / recording.period, rtol=1e-9, atol=0.0)
     position, scored = np.zeros((n, 3)), np.zeros(n, bool)
     if truth is not None:
@@ -154,6 +156,7 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
     return NoiseTrial(
         prepared.trial,
         pad(plain, size),
+        np.array(config.noise.axes),
         np.asarray(prepared.rest[0]),
         np.asarray(config.smoother.relinearisations),
         pad(position, size),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float, Int
+from scipy.stats import norm
 
 from jaxsat.config import Config
 from jaxsat.inertial.smoother import smooth
@@ -27,11 +28,12 @@ from . import drawing_extras as drawing
 from .trials import QUANTILES, Settings, clipped, config_of, record
 
 SIZES = Sizes(256, 64)
+SHARES = (0.5, 0.9)
 SOLVERS = {"gauss_newton": projected_gauss_newton, "projected_gradient": projected_gradient}
 
 
 def coverage(chosen: Settings, out: Path) -> None:
-    """How often an interval of 95 % holds the truth: filled values, and the three coordinates of the end.
+    """How often intervals hold the truth: filled values, peaks, and the three coordinates of the end.
 
     From `estimate`, recording by recording: a sweep gives no covariances.
     """
@@ -46,12 +48,19 @@ def coverage(chosen: Settings, out: Path) -> None:
             sd = np.sqrt(np.diagonal(found.trajectory.covariance[-1])[3:6])
             error = (found.trajectory.position - truth.position)[-1]
             ends[method] += (np.abs(error) / sd).tolist()
+            # All that saturates is one gap.
+            top = np.argmax(np.abs(found.filled[lost]))
+            peak = np.abs(found.filled[lost])[top] - np.abs(truth.signal[lost]).max()
+            scores = {"fill": away, "peak": peak / found.signal_sd[lost][top], "end": error / sd}
             rows.append(
                 {
                     "method": method,
                     "seed": seed,
-                    "fill": float(np.mean(np.abs(away) <= 1.96)),
-                    "end": float(np.mean(np.abs(error) <= 1.96 * sd)),
+                    **{
+                        f"{what}_{share * 100:.0f}": float(np.mean(np.abs(z) <= norm.ppf(0.5 + share / 2)))
+                        for what, z in scores.items()
+                        for share in SHARES
+                    },
                     "error": float(np.linalg.norm(error)),
                     "sd": float(np.linalg.norm(sd)),
                 }
@@ -60,8 +69,7 @@ def coverage(chosen: Settings, out: Path) -> None:
     groups = table.groupby("method", sort=False)
     held = groups.agg(
         seeds=("seed", "size"),
-        fill=("fill", "mean"),
-        end=("end", "mean"),
+        **{column: (column, "mean") for column in table if column.startswith(("fill_", "peak_", "end_"))},
         error_median=("error", "median"),
         sd_median=("sd", "median"),
     )
