@@ -21,6 +21,7 @@ from jaxsat.inertial.orientation import (
     orientation,
     start_at_rest,
 )
+from jaxsat.inertial.programs import make_room
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.preparation import LEFT_OFFSET_SD, MOVING_START_SD, MOVING_START_TILT_SD, given_gains
 from jaxsat.saturation.interpolation import interpolate_gaps
@@ -83,6 +84,7 @@ def orient(recording: Recording, config: Config | None = None) -> Orientation:
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
     saturated, sign = saturation_mask(recording, rails)
     first = _first_rest(recording)
+    make_room()
     with jax.enable_x64(True):
         start = start_at_rest(jnp.asarray(recording.signal[:first]))
         moving = first < round(FIRST / period)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsat.config import Config
 from jaxsat.errors import InputError
 from jaxsat.inertial.orientation import Gains, Start, backward
-from jaxsat.inertial.programs import stored_jit
+from jaxsat.inertial.programs import make_room, stored_jit
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
 from jaxsat.inertial.smoother import Filtered, Rows
 from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
@@ -57,6 +57,7 @@ def prepare(recording: Recording, config: Config) -> Prepared:
 
 def prepare_and_filter(recording: Recording, config: Config) -> tuple[Prepared, Filtered]:
     """And the filter pass over it, saturated values being free within their bounds."""
+    make_room()
     warnings = check(recording)
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
     saturated, sign = saturation_mask(recording, rails)

@@ -1,5 +1,7 @@
 """Traces that are kept: the same results without running the Python code again, and never a wrong one."""
 
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -95,3 +97,25 @@ def test_inside_another_program_it_is_the_function(folder):
     found = jax.vmap(lambda value: run(Pair(value, "a"), jnp.asarray(2.0), 3)[1]["sum"])(jnp.ones((4, 3)))
     np.testing.assert_allclose(found, 3.0)
     assert not folder.exists()
+
+
+def test_a_process_does_not_die_of_the_programs_that_it_has_compiled(monkeypatch):
+    """Where half of the allowed memory maps are taken they are forgotten, and compiled again when they are needed."""
+    maps = Path("/proc/self/maps")
+    if not maps.exists():
+        pytest.skip("memory maps are counted on Linux only")
+
+    def count():
+        return maps.read_bytes().count(b"\n")
+
+    @jax.jit
+    def bent(x):
+        return jnp.sort(jnp.sin(x)) @ jnp.cumsum(x)
+
+    expected, before = bent(jnp.arange(7.0)), count()
+    programs.make_room()
+    assert bent._cache_size() == 1
+    monkeypatch.setattr(programs, "MOST_MAPS", 0.0)
+    programs.make_room()
+    assert bent._cache_size() == 0 and count() < before
+    assert bent(jnp.arange(7.0)) == expected

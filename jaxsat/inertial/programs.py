@@ -1,4 +1,4 @@
-"""Compiled functions whose traces outlive the process.
+"""Compiled functions whose traces outlive the process, and which do not crowd it.
 
 JAX keeps compiled programs on disk, but to know which one it needs it traces the Python code anew in each process:
 most of what a later run of the command line would wait for. `stored_jit` keeps the traces too.
@@ -21,6 +21,9 @@ from jax.core import Tracer
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+# Of the memory maps that Linux allows a process so many may be taken before compiled programs are forgotten.
+MOST_MAPS = 0.5
+
 _folder: Path | None = None
 _loaded: dict[str, Callable[..., Any]] = {}
 
@@ -29,6 +32,22 @@ def keep_traces(folder: Path | None) -> None:
     """From now on traces are read from and written to this folder; None: to none, as it is at first."""
     global _folder
     _folder = folder
+
+
+def make_room() -> None:
+    """Forget compiled programs where the process has many: to be called before the next recording.
+
+    On a CPU each takes hundreds of memory maps, and a process that has no more of them dies in the next compilation
+    (jaxlib 0.10, some 100 programs). What is needed again comes from JAX's cache on disk, if there is one.
+    """
+    try:
+        taken = Path("/proc/self/maps").read_bytes().count(b"\n")
+        most = int(Path("/proc/sys/vm/max_map_count").read_text())
+    except OSError:
+        return
+    if taken > MOST_MAPS * most:
+        _loaded.clear()
+        jax.clear_caches()
 
 
 def stored_jit(function: F) -> F:

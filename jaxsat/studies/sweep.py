@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
+from jaxsat.inertial.programs import make_room
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
@@ -78,6 +79,7 @@ def sweep(
         batches, rows = _batches(loaders, plan)
         total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
         for batch in batches:
+            make_room()
             for indices, values, real in _chunks(batch, plan):
                 cases = [batch.cases[i] for i in indices]
                 scores = run_elements(
