@@ -92,6 +92,24 @@ def test_a_folder_that_cannot_be_written_costs_a_trace_only(folder):
     check(fresh()(PAIR, np.asarray(2.0), 3))
 
 
+def test_what_cannot_be_kept_runs_all_the_same(folder, monkeypatch):
+    from jax import export
+
+    def refuse(*_):
+        raise ValueError("not this operation")
+
+    monkeypatch.setattr(export, "export", refuse)
+    run = fresh()
+    for _ in range(2):
+        check(run(PAIR, np.asarray(2.0), 3))
+    assert TRACED == [("a", 3)] and not folder.exists()
+
+
+def test_a_fault_of_the_function_is_the_callers(folder):
+    with pytest.raises(TypeError):
+        fresh()(PAIR, np.ones(7), 3)
+
+
 def test_inside_another_program_it_is_the_function(folder):
     run = fresh()
     found = jax.vmap(lambda value: run(Pair(value, "a"), jnp.asarray(2.0), 3)[1]["sum"])(jnp.ones((4, 3)))

@@ -25,7 +25,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 MOST_MAPS = 0.5
 
 _folder: Path | None = None
-_loaded: dict[str, Callable[..., Any]] = {}
+_loaded: dict[str, Callable[..., Any] | None] = {}
 
 
 def keep_traces(folder: Path | None) -> None:
@@ -54,7 +54,8 @@ def stored_jit(function: F) -> F:
     """`equinox.filter_jit` of a function of positional arguments that returns arrays; its trace is kept.
 
     A trace is for the code of the package, the versions of what it runs on, the kind of device, and the arguments'
-    shapes, types and whatever is no array. One that cannot be read or written is made anew.
+    shapes, types and whatever is no array. One that cannot be read is made anew; where none can be made or written it
+    goes without.
     """
     jitted = eqx.filter_jit(function)
 
@@ -70,12 +71,10 @@ def stored_jit(function: F) -> F:
         key = hashlib.sha256(repr(parts).encode()).hexdigest()
         if key not in _loaded:
             path = _folder / f"{key}.trace"
-            program = _read(path)
-            if program is None:
-                whole = lambda *given: function(*eqx.combine(jax.tree.unflatten(structure, given), rest))  # noqa: E731
-                program = _trace(whole, kinds, path)
-            _loaded[key] = program
-        return _loaded[key](*leaves)
+            whole = lambda *given: function(*eqx.combine(jax.tree.unflatten(structure, given), rest))  # noqa: E731
+            _loaded[key] = _read(path) or _trace(whole, kinds, path)
+        program = _loaded[key]
+        return jitted(*args) if program is None else program(*leaves)
 
     return call  # type: ignore[return-value]
 
@@ -108,7 +107,7 @@ def _read(path: Path) -> Callable[..., Any] | None:
         return None
 
 
-def _trace(function: Callable[..., Any], kinds: list[Any], path: Path) -> Callable[..., Any]:
+def _trace(function: Callable[..., Any], kinds: list[Any], path: Path) -> Callable[..., Any] | None:
     from jax import export
 
     structure = None
@@ -119,7 +118,11 @@ def _trace(function: Callable[..., Any], kinds: list[Any], path: Path) -> Callab
         return found
 
     shapes = [jax.ShapeDtypeStruct(kind.shape, kind.dtype) for kind in kinds]
-    exported = export.export(jax.jit(flat))(*shapes)
+    try:
+        exported = export.export(jax.jit(flat))(*shapes)
+    # Not every operation of every device can be kept; a fault of the function shows again without.
+    except Exception:
+        return None
     assert structure is not None, "it was traced"
     skeleton = jax.tree.unflatten(structure, list(range(structure.num_leaves)))
     try:
