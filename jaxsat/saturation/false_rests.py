@@ -15,7 +15,7 @@ from jaxsat.saturation.compensate import filter_part
 from jaxsat.saturation.layout import Trial
 from jaxsat.signals.rests import Segments
 
-# A rest is false where leaving it out lowers J* by so much, and by so many times what a rest of the recording costs.
+# A rest is false where leaving it out lowers J* by so much, and by so many times what a usual rest costs.
 # On the 26 given PyShoe trials (flags of the data set and the package's own rests) true ones reach 1,412, and all but
 # those of crawling 345; ten samples in a swing at 0.5 m/s 3,200, at 2.5 m/s 60,000.
 LEAST_FALL, TIMES_USUAL = 2500.0, 25.0
@@ -37,7 +37,8 @@ def false_rests(trial: Trial, segments: Segments, filtered: Filtered) -> Bool[np
     total = np.concatenate([[0.0], np.cumsum(np.asarray(filtered.cost))])
     cost = total[end] - total[arrival]
     rests = end > arrival
-    least = max(LEAST_FALL, TIMES_USUAL * float(np.median(cost[rests]))) if rests.any() else np.inf
+    # The usual one is the first quartile, since in a short recording a false rest spoils several.
+    least = max(LEAST_FALL, TIMES_USUAL * float(np.quantile(cost[rests], 0.25))) if rests.any() else np.inf
     blame = np.zeros(len(segments))
     # J* cannot fall by more than both rests cost.
     suspect = (cost[:-1] + cost[1:] > least) & (departure[:-1] >= 0) & rests[1:]
