@@ -17,7 +17,8 @@ from jaxsat.signals.rests import Segments
 
 # A rest is false where leaving it out lowers J* by so much, and by so many times what a usual rest costs. On the
 # given recordings (rests of the data set and the package's own) true ones reach 7,768 after hard heel strikes, 40
-# times the usual, and 1,412 in PyShoe; ten samples in a PyShoe swing at 0.5 m/s 3,200, at 1.3 m/s 17,000, at 2.5 m/s 60,000.
+# times the usual, and 1,412 in PyShoe. Ten samples of a PyShoe swing reach 3,200 at 0.5 m/s, 17,000 at 1.3 m/s and
+# 60,000 at 2.5 m/s.
 LEAST_FALL, TIMES_USUAL = 10_000.0, 50.0
 # Without it, the next rest costs at most so much of what both did.
 MOST_LEFT = 0.1
