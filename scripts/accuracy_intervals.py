@@ -56,7 +56,7 @@ def board(table: pd.DataFrame) -> Iterator[Row]:
         for share, (low, high) in GOALS.items():
             column = f"within_{share * 100:.0f}"
             value = float(np.average(rows[column], weights=rows["count"]))
-            by_trial = rows.groupby("trial")[column].mean()
+            by_trial = rows.groupby("trial")[column].mean().to_numpy()
             yield Row(
                 f"interval_{share * 100:.0f}_{what}", abs(value - share), "1", "lower", high - share, None,
                 f"{value:.0%} of {rows['count'].sum()} {words} lie in their {share:.0%} intervals (goal {low:.0%} to "
