@@ -56,9 +56,9 @@ def board(table: pd.DataFrame) -> Iterator[Row]:
         for share, (low, high) in GOALS.items():
             column = f"within_{share * 100:.0f}"
             value = float(np.average(rows[column], weights=rows["count"]))
-            by_trial = rows.groupby("trial")[column].mean().to_numpy()
+            by_trial = [float(np.mean(part[column])) for _, part in rows.groupby("trial")]
             yield Row(
                 f"interval_{share * 100:.0f}_{what}", abs(value - share), "1", "lower", high - share, None,
                 f"{value:.0%} of {rows['count'].sum()} {words} lie in their {share:.0%} intervals (goal {low:.0%} to "
-                f"{high:.0%}); trials {by_trial.min():.0%} to {by_trial.max():.0%}",
+                f"{high:.0%}); trials {min(by_trial):.0%} to {max(by_trial):.0%}",
             )  # fmt: skip
