@@ -259,12 +259,12 @@ def test_help_and_version_load_nothing_heavy():
 def test_the_compilation_cache_of_the_user_is_respected(monkeypatch, tmp_path):
     script = (
         "import jax; from jaxsat.cli.shared import use_compilation_cache as use; use(); "
-        "print(jax.config.jax_compilation_cache_dir)"
+        "from jaxsat.inertial import programs; print(jax.config.jax_compilation_cache_dir, programs._folder)"
     )
     for given, expected in (({}, tmp_path / "xdg" / "jaxsat"), ({"JAX_COMPILATION_CACHE_DIR": "/x"}, "/x")):
         environment = {"XDG_CACHE_HOME": str(tmp_path / "xdg"), "PATH": "", **given}
         done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
-        assert done.stdout.strip() == str(expected)
+        assert done.stdout.split() == [str(expected), f"{expected}/traces"]
 
 
 def test_a_bug_is_not_hidden(monkeypatch, bar):

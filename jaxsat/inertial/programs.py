@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -71,12 +71,15 @@ def stored_jit(function: F) -> F:
         key = hashlib.sha256(repr(parts).encode()).hexdigest()
         if key not in _loaded:
             path = _folder / f"{key}.trace"
-            whole = lambda *given: function(*eqx.combine(jax.tree.unflatten(structure, given), rest))  # noqa: E731
+
+            def whole(*given):
+                return function(*eqx.combine(jax.tree.unflatten(structure, given), rest))
+
             _loaded[key] = _read(path) or _trace(whole, kinds, path)
         program = _loaded[key]
         return jitted(*args) if program is None else program(*leaves)
 
-    return call  # type: ignore[return-value]
+    return cast(F, call)
 
 
 @cache
