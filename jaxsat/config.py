@@ -32,8 +32,10 @@ class Noise(_Section):
 
     gyr_density: float = Field(default=2e-3, gt=0, description="angular-rate noise density (rad/s/√Hz)")
     acc_density: float = Field(default=4e-3, gt=0, description="specific-force noise density (m/s²/√Hz)")
-    axes: tuple[_Factor, _Factor, _Factor, _Factor, _Factor, _Factor] = Field(
-        default=(1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    axes: tuple[_Factor, ...] = Field(
+        default=(1.0,) * 6,
+        min_length=6,
+        max_length=6,
         description="density of each channel, gyr_x to acc_z, over that of its sensor",
     )
     rest_velocity_sd: float = Field(
