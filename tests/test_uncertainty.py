@@ -15,16 +15,18 @@ from jaxsat.pipeline import estimate
 from jaxsat.present.tables import gaps_table
 from jaxsat.saturation.prior import Known
 from jaxsat.saturation.segment import condense, value_gradient_root
-from jaxsat.saturation.uncertainty import truncated_sd, uncertainty
+from jaxsat.saturation.uncertainty import EXPECTED, truncated_deviation, uncertainty
 
-COLUMNS = jax.jit(value_gradient_root)
+COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
 
 
 @jax.jit
-def judge(segment, delta):
+def judge(segment, delta, value=EXPECTED):
+    """value: of what is left at δ; as much as is expected, unless it is said."""
     known = segment.known
     _, slope, columns = value_gradient_root(delta, condense(segment), problems.GRAVITY)
-    return uncertainty(segment, delta, slope + known.slope + known.precision @ delta, columns)
+    slope = slope + known.slope + known.precision @ delta
+    return uncertainty(segment, delta, value - known.energy, slope, columns)
 
 
 def known_segment(scale: float):
@@ -34,41 +36,100 @@ def known_segment(scale: float):
     precision[:6, :6] = (root @ root.T + np.eye(6)) * scale
     covariance = jnp.asarray(np.linalg.inv(precision))
     variance, harmful = jnp.diagonal(covariance), jnp.zeros(8, bool)
-    prior = Known(jnp.asarray(precision), jnp.zeros(8), covariance, variance, harmful)
+    prior = Known(
+        jnp.asarray(precision), jnp.zeros(8), jnp.asarray(0.5), covariance, jnp.ones(8), variance, harmful
+    )
     segment = build(False)
     gaps = jnp.array([0, 0, 1, 2, 3, 4, 7, 7])
     return eqx.tree_at(lambda s: (s.known, s.gap), segment, (prior, gaps), is_leaf=lambda x: x is None)
 
 
-def test_sd_of_a_truncated_gaussian_is_that_of_scipy():
-    centre, sd, upper = np.array([0.5, -1.0, -3.0, 4.0, 0.1]), np.array([0.2, 0.7, 1.0, 0.5, 50.0]), 3.0
-    expected = truncnorm(-centre / sd, (upper - centre) / sd, centre, sd).std()
-    found = jax.jit(truncated_sd)(jnp.asarray(centre), jnp.asarray(sd), jnp.full(5, upper))
-    np.testing.assert_allclose(found, expected, rtol=1e-3)
+def deviation(centre, sd, upper, about):
+    """Root mean square about a value under a Gaussian cut off below 0 and above `upper`, by scipy."""
+    sd = np.maximum(sd, np.maximum(-centre, centre - upper))
+    cut = truncnorm(-centre / sd, (upper - centre) / sd, centre, sd)
+    return np.sqrt(cut.var() + (cut.mean() - about) ** 2)
+
+
+def test_deviation_of_a_truncated_gaussian_is_that_of_scipy():
+    """Within the limits, a little and far beyond them, and so wide that only they count."""
+    centre = np.array([0.5, -0.5, -30.0, 3.2, 40.0, 0.1])
+    sd, upper, about = (
+        np.array([0.2, 0.7, 1.0, 0.5, 0.5, 50.0]),
+        3.0,
+        np.array([0.5, 0.0, 0.0, 3.0, 3.0, 1.0]),
+    )
+    found = jax.jit(truncated_deviation)(*map(jnp.asarray, (centre, sd, np.full(6, upper), about)))
+    np.testing.assert_allclose(found, deviation(centre, sd, upper, about), rtol=1e-6)
+    # What was put 30 below its rail was off by about as much.
+    assert found[2] > 1.0
+
+
+def dense(segment, factor=1.0):
+    """Of the first gap's two values and their sum, by dense algebra: covariances before and after, deviations.
+
+    Away from a mode the slope is large, and a centre that is found from it agrees to five digits only.
+    """
+    # A is compared with derivatives of the strapdown in test_segment.
+    _, slope, columns = COLUMNS(DELTA, condense(segment), problems.GRAVITY)
+    A = np.stack(columns, axis=1)[:6]
+    precision = np.asarray(segment.known.precision)[:6, :6]
+    delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
+    pull = np.asarray(slope)[:6] + precision @ delta
+    before, after = np.linalg.inv(precision), np.linalg.inv(precision + A @ A.T / factor)
+    centre = delta - np.linalg.solve(precision + A @ A.T, pull)
+    sd = np.sqrt(np.diagonal(after))
+    wide = np.maximum(1.0, np.maximum(-centre, centre - bound) / sd)
+    pair = np.array([1.0, 1, 0, 0, 0, 0])
+    of_sum = np.sqrt(pair @ (np.outer(wide, wide) * after) @ pair)
+    of_sum = deviation(pair @ centre, of_sum, pair @ bound, pair @ delta)
+    return pair @ before @ pair, pair @ after @ pair, deviation(centre, sd, bound, delta), of_sum
 
 
 def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
     segment = known_segment(1e-2)
     found = judge(segment, DELTA)
-    # A is compared with derivatives of the strapdown in test_segment.
-    _, _, columns = COLUMNS(DELTA, condense(segment), problems.GRAVITY)
-    A = np.stack(columns, axis=1)[:6]
-    hessian = A @ A.T
-    precision = np.asarray(segment.known.precision)[:6, :6]
-    before, after = np.linalg.inv(precision), np.linalg.inv(precision + hessian)
-    pair = np.array([1.0, 1, 0, 0, 0, 0])
-    np.testing.assert_allclose(found.gap_sd[0], np.sqrt(pair @ after @ pair), rtol=1e-9)
-    share = 1 - (pair @ after @ pair) / (pair @ before @ pair)
-    assert found.identified[0] == found.identified[1] == pytest.approx(share, abs=1e-9)
+    before, after, sd, of_sum = dense(segment)
+    np.testing.assert_allclose(found.sd[:6], sd, rtol=1e-4)
+    np.testing.assert_allclose(found.gap_sd[:2], of_sum, rtol=1e-4)
+    assert found.identified[0] == found.identified[1] == pytest.approx(1.0 - after / before, abs=1e-9)
     assert not np.asarray(found.sd[6:]).any() and not np.asarray(found.identified[6:]).any()
+
+
+def test_where_prior_and_data_disagree_the_data_are_believed_less():
+    """Their variance is scaled by what is left at the mode, one more motion having fitted as expected."""
+    segment = known_segment(1e-2)
+    alike, agreed = judge(segment, DELTA), judge(segment, DELTA, 0.0)
+    np.testing.assert_array_equal(agreed.gap_sd, alike.gap_sd)
+    for factor in (2.0, 5.0):
+        found = judge(segment, DELTA, (2.0 * factor - 1.0) * EXPECTED)
+        before, after, sd, of_sum = dense(segment, factor)
+        np.testing.assert_allclose(found.sd[:6], sd, rtol=1e-4)
+        np.testing.assert_allclose(found.gap_sd[0], of_sum, rtol=1e-4)
+        assert found.identified[0] == pytest.approx(1.0 - after / before, abs=1e-9)
+        assert found.identified[0] < alike.identified[0]
+
+
+def test_hidden_peaks_that_were_far_off_widen_what_is_known():
+    """A prior of twice the sd, as if δ had been its mode."""
+    segment = known_segment(1.0)
+    doubted = eqx.tree_at(lambda s: s.known.doubt, segment, jnp.full(8, 2.0))
+    slope, nothing = jnp.zeros(8), 6 * (jnp.zeros(8),)
+    known, plain = (JUDGE(s, DELTA, -s.known.energy, slope, nothing) for s in (doubted, segment))
+    covariance = np.asarray(segment.known.covariance)[:6, :6]
+    delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
+    for found, times in ((plain, 1.0), (known, 2.0)):
+        sd = times * np.sqrt(np.diagonal(covariance))
+        np.testing.assert_allclose(found.sd[:6], deviation(delta, sd, bound, delta), rtol=1e-6)
+    assert (np.asarray(known.sd)[:6] > np.asarray(plain.sd)[:6]).all()
 
 
 def test_without_a_rest_the_prior_decides():
     segment = eqx.tree_at(lambda s: s.arrival, known_segment(1.0), jnp.zeros((10, 10)))
     found = judge(segment, DELTA)
     np.testing.assert_allclose(found.identified, 0.0, atol=1e-12)
-    prior = np.linalg.inv(np.asarray(segment.known.precision))
-    np.testing.assert_allclose(found.gap_sd[0], np.sqrt(prior[:2, :2].sum()), rtol=1e-9)
+    *_, of_sum = dense(segment)
+    np.testing.assert_allclose(found.gap_sd[0], of_sum, rtol=1e-4)
 
 
 def test_intervals_of_the_bar_cover_its_truth():

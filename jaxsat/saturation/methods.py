@@ -180,6 +180,6 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
         at_bound=at_bound,
         uncertainty=None
         if known is None
-        else uncertainty(segment, delta, solution.gradient, solution.columns),
+        else uncertainty(segment, delta, solution.value, solution.gradient, solution.columns),
         inflated=jnp.zeros_like(real) if known is None else known.harmful,
     )

@@ -147,9 +147,13 @@ class Known(eqx.Module):
     """Ω."""
     slope: Float[Array, "m"]
     """b."""
+    energy: Float[Array, ""]
+    """Of the prior at δ = 0, its least being zero."""
     covariance: Float[Array, "m m"]
-    """Of δ before rests are heard: Ω⁻¹, its sd scaled by how far off hidden peaks were. The mode of δ does without
-    that: it was no nearer to the truth with it, and worse where short gaps were believed less."""
+    """Ω⁻¹."""
+    doubt: Float[Array, "m"]
+    """By what to multiply its sd: how far off hidden peaks were. The mode of δ does without that: it was no nearer to
+    the truth with it, and worse where short gaps were believed less."""
     variance: Float[Array, "m"]
     """Of each value about what it is set to.
 
@@ -212,12 +216,14 @@ def of_values(
     nearness = jnp.maximum(1.0 - jnp.abs(place[:, None] - jnp.arange(float(len(NODES)))[None]), 0.0)
     excess = jnp.where(real, jnp.sum(nearness * prior.excess[channel], axis=1), 1.0)
     harmful = real & prior.harmful[channel, jnp.round(place).astype(int)]
-    sd = jnp.sqrt(excess)
-    covariance = covariance * sd[:, None] * sd[None]
+    variance = excess * jnp.diagonal(covariance) + jnp.where(harmful, mean**2, 0.0)
+    slope = -precision @ mean
     return Known(
         precision=precision,
-        slope=-precision @ mean,
+        slope=slope,
+        energy=-0.5 * slope @ mean,
         covariance=covariance,
-        variance=jnp.where(real, jnp.diagonal(covariance) + jnp.where(harmful, mean**2, 0.0), 0.0),
+        doubt=jnp.sqrt(excess),
+        variance=jnp.where(real, variance, 0.0),
         harmful=harmful,
     )

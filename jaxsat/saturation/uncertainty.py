@@ -2,7 +2,11 @@
 
 About its mode the posterior is Gaussian with precision Ω + A Aᵀ: that of the prior, and that of the data in six
 directions (attitude and velocity on arrival). A value lies beyond its rail and within its bound, so its own
-distribution is that Gaussian's marginal, cut off there.
+distribution is that Gaussian's marginal, cut off there; an sd is about the value reported, the mode.
+
+The noise of the data is that of the sensor; what scale errors of the sensor, its mounting or a foot that rolls do to
+attitude and velocity on arrival is not in it. It shows where prior and data disagree more than both allow, and the
+data's variance is scaled by as much: the a posteriori variance factor of geodesy, the Birge ratio of metrology.
 """
 
 import equinox as eqx
@@ -13,8 +17,9 @@ from jaxtyping import Array, Float
 from jaxsat.inertial.dense import solve_positive
 from jaxsat.saturation.segment import Segment
 
-# A cut-off further than so many sd into the tail: what is left there behaves as at this one.
-_FURTHEST = 6.0
+# ½ χ² of six directions is expected of the energy that is left at the mode. As if that had been seen once before:
+# one segment alone says little about its scale.
+EXPECTED = 3.0
 
 
 class Uncertainty(eqx.Module):
@@ -31,49 +36,65 @@ class Uncertainty(eqx.Module):
 def uncertainty(
     segment: Segment,
     delta: Float[Array, "m"],
+    value: Float[Array, ""],
     slope: Float[Array, "m"],
     columns: tuple[Float[Array, "m"], ...],
 ) -> Uncertainty:
     """At the mode δ of a segment that has a signal prior.
 
-    slope: of f(δ) and the prior's energy there; columns: of A.
+    value, slope: of f(δ) + ½ δᵀΩδ + bᵀδ there; columns: of A.
     """
     known = segment.known
     assert known is not None, "the signal prior was gathered"
-    before = known.covariance
-    A = jnp.stack(columns, axis=1)
+    A, one = jnp.stack(columns, axis=1), jnp.eye(len(columns))
+    # The centre of the Gaussian that was searched: where a limit holds δ, it lies beyond it.
+    seen = known.covariance @ A
+    centre = delta - known.covariance @ slope + seen @ solve_positive(one + A.T @ seen, seen.T @ slope)
+
+    before = known.covariance * known.doubt[:, None] * known.doubt[None]
     seen = before @ A
-    inner = jnp.eye(A.shape[1]) + A.T @ seen
-    after = before - seen @ solve_positive(inner, seen.T)
+    factor = jnp.maximum((value + known.energy + EXPECTED) / (2.0 * EXPECTED), 1.0)
+    after = before - seen @ solve_positive(factor * one + A.T @ seen, seen.T)
 
     real = segment.bound > 0.0
     together = (segment.gap[:, None] == segment.gap[None]) & real[:, None] & real[None]
 
-    def of_gap(covariance):
-        rows = jnp.sum(jnp.where(together, covariance, 0.0), axis=1)
-        return jnp.zeros_like(rows).at[segment.gap].add(rows)[segment.gap]
+    def of_gap(values):
+        return jnp.zeros_like(values).at[segment.gap].add(jnp.where(real, values, 0.0))[segment.gap]
 
-    gap_before, gap_after = of_gap(before), of_gap(after)
-    share = 1.0 - gap_after / jnp.where(gap_before > 0.0, gap_before, 1.0)
-    gap_sd = jnp.sqrt(jnp.maximum(gap_after, 0.0))
-    # Where a bound holds δ, the Gaussian's own centre lies beyond it.
-    centre, sd = delta - after @ slope, jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
-    sd = jnp.where(known.harmful, jnp.sqrt(known.variance), truncated_sd(centre, sd, segment.bound))
+    def variance(covariance):
+        return of_gap(jnp.sum(jnp.where(together, covariance, 0.0), axis=1))
+
+    gap_before = variance(before)
+    share = 1.0 - variance(after) / jnp.where(gap_before > 0.0, gap_before, 1.0)
+    sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
+    wider = widened(centre, sd, segment.bound) / sd
+    gap_sd = jnp.sqrt(jnp.maximum(variance(after * wider[:, None] * wider[None]), 1e-300))
+    of_value = truncated_deviation(centre, sd, segment.bound, delta)
+    of_sum = truncated_deviation(of_gap(centre), gap_sd, of_gap(segment.bound), of_gap(delta))
     return Uncertainty(
-        sd=jnp.where(real, sd, 0.0),
-        gap_sd=jnp.where(real, gap_sd, 0.0),
+        sd=jnp.where(real, jnp.where(known.harmful, jnp.sqrt(known.variance), of_value), 0.0),
+        gap_sd=jnp.where(real, of_sum, 0.0),
         identified=jnp.where(real, share, 0.0),
     )
 
 
-def truncated_sd(
-    centre: Float[Array, "m"], sd: Float[Array, "m"], upper: Float[Array, "m"]
+def widened(centre: Float[Array, "m"], sd: Float[Array, "m"], upper: Float[Array, "m"]) -> Float[Array, "m"]:
+    """sd of Gaussians that are cut off below 0 and above `upper`, at least as large as the centre lies beyond either.
+
+    That the sensor saturated is an observation too: a Gaussian that puts a value below the rail was off by as much.
+    """
+    return jnp.maximum(sd, jnp.maximum(-centre, centre - upper))
+
+
+def truncated_deviation(
+    centre: Float[Array, "m"], sd: Float[Array, "m"], upper: Float[Array, "m"], about: Float[Array, "m"]
 ) -> Float[Array, "m"]:
-    """sd of Gaussians cut off below 0 and above `upper`."""
-    low = jnp.minimum(-centre / sd, _FURTHEST)
-    high = jnp.maximum((upper - centre) / sd, jnp.maximum(low + 1e-3, -_FURTHEST))
-    low = jnp.minimum(low, high - 1e-3)
+    """Root mean square deviation from `about` under Gaussians, `widened`, cut off below 0 and above `upper`."""
+    sd = widened(centre, sd, upper)
+    low, high = -centre / sd, (upper - centre) / sd
     inside = jnp.maximum(norm.cdf(high) - norm.cdf(low), 1e-300)
     at_low, at_high = norm.pdf(low) / inside, norm.pdf(high) / inside
-    shrink = 1.0 + low * at_low - high * at_high - (at_low - at_high) ** 2
-    return sd * jnp.sqrt(jnp.clip(shrink, 0.0, 1.0))
+    mean, square = at_low - at_high, 1.0 + low * at_low - high * at_high
+    away = (centre - about) / sd
+    return sd * jnp.sqrt(jnp.maximum(square + away * (2.0 * mean + away), 0.0))
