@@ -9,7 +9,7 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -191,8 +191,12 @@ def _number(value: float | int | None) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Under a temporary name first: a file with the final name is always whole."""
+def write_whole(path: Path, content: str | Callable[[Path], object]) -> None:
+    """A text, or what a function writes to the path given to it, under a temporary name first: a file with the
+    final name is always whole."""
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, "utf-8")
+    if callable(content):
+        content(partial)
+    else:
+        partial.write_text(content, "utf-8")
     os.replace(partial, path)

@@ -3,7 +3,7 @@
 Gravity is the standard one: a simulated sensor at rest reads 9.80665 m/s².
 """
 
-import os
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Key
 from jaxsat.errors import InputError
 from jaxsat.inertial.rotations import quat_conjugate, quat_multiply, quat_rotate
 from jaxsat.signals.recording import CHANNELS, Recording
+from jaxsat.studies.boards import write_whole
 from jaxsat.studies.motions import Motion
 
 GRAVITY = 9.80665
@@ -204,13 +205,11 @@ def write_simulation(path: Path, recording: Recording, truth: Truth, *, rest: bo
 
 
 def _write(table: pd.DataFrame, path: Path) -> None:
-    """Under a temporary name first: a file with the final name is always whole."""
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"{path}: unknown table format '{path.suffix}'; end the name in .csv or .parquet.")
-    partial = path.with_name(f".{path.name}.partial")
+    write = partial(table.to_csv, index=False) if path.suffix == ".csv" else table.to_parquet
     try:
-        table.to_csv(partial, index=False) if path.suffix == ".csv" else table.to_parquet(partial)
-        os.replace(partial, path)
+        write_whole(path, write)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be written ({error.strerror or error}); choose a writable folder."
