@@ -38,7 +38,8 @@ SIGNALS = [
     *(f"sat_{channel}" for channel in CHANNELS),
     *(f"{channel}_sd" for channel in CHANNELS),
 ]
-SEGMENTS = ["segment", "start", "end", "saturated", "length", "length_sd", "climb", "climb_sd", "status"]
+SEGMENTS = ["segment", "start", "end", "saturated", "length", "length_sd", "climb", "climb_sd"]
+SEGMENTS += ["rank", "seen", "status"]
 GAPS = ["channel", "start", "end", "rail", "peak", "peak_sd", "impulse", "impulse_sd", "identified", "status"]
 
 

@@ -1,21 +1,24 @@
 """What is said about filled values: against SciPy, against a dense posterior, and against the truth over seeds."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
+from scipy.linalg import eigh
 from scipy.stats import norm, truncnorm
 from test_pipeline import BAR, bar
 from test_segment import DELTA, build
 
 from jaxsat.config import load_config
 from jaxsat.pipeline import estimate
-from jaxsat.present.tables import gaps_table
+from jaxsat.present.tables import gaps_table, segments_table
 from jaxsat.saturation.prior import Known
-from jaxsat.saturation.segment import condense, value_gradient_root
-from jaxsat.saturation.uncertainty import EXPECTED, truncated_deviation, uncertainty
+from jaxsat.saturation.segment import condense, value_and_root, value_gradient_root
+from jaxsat.saturation.uncertainty import EXPECTED, LEAST_SEEN, truncated_deviation, uncertainty
 
 COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
 
@@ -24,9 +27,11 @@ COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
 def judge(segment, delta, value=EXPECTED):
     """value: of what is left at δ; as much as is expected, unless it is said."""
     known = segment.known
-    _, slope, columns = value_gradient_root(delta, condense(segment), problems.GRAVITY)
+    condensed = condense(segment)
+    _, slope, _ = value_gradient_root(delta, condensed, problems.GRAVITY)
+    _, columns, effects = value_and_root(delta, condensed, problems.GRAVITY)
     slope = slope + known.slope + known.precision @ delta
-    return uncertainty(segment, delta, value - known.energy, slope, columns)
+    return uncertainty(segment, delta, value - known.energy, slope, columns, effects)
 
 
 def known_segment(scale: float):
@@ -86,6 +91,15 @@ def dense(segment, factor=1.0):
     return pair @ before @ pair, pair @ after @ pair, deviation(centre, sd, bound, delta), of_sum
 
 
+def rank(segment):
+    """Directions of δ in which the data say anything beside the prior, by the generalised eigenvalues."""
+    _, _, columns = COLUMNS(DELTA, condense(segment), problems.GRAVITY)
+    A = np.stack(columns, axis=1)[:6]
+    return int(
+        np.sum(eigh(A @ A.T, np.asarray(segment.known.precision)[:6, :6], eigvals_only=True) > LEAST_SEEN)
+    )
+
+
 def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
     segment = known_segment(1e-2)
     found = judge(segment, DELTA)
@@ -94,6 +108,7 @@ def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
     np.testing.assert_allclose(found.gap_sd[:2], of_sum, rtol=1e-4)
     assert found.identified[0] == found.identified[1] == pytest.approx(1.0 - after / before, abs=1e-9)
     assert not np.asarray(found.sd[6:]).any() and not np.asarray(found.identified[6:]).any()
+    assert found.rank == rank(segment)
 
 
 def test_where_prior_and_data_disagree_the_data_are_believed_less():
@@ -115,7 +130,7 @@ def test_hidden_peaks_that_were_far_off_widen_what_is_known():
     segment = known_segment(1.0)
     doubted = eqx.tree_at(lambda s: s.known.doubt, segment, jnp.full(8, 2.0))
     slope, nothing = jnp.zeros(8), 6 * (jnp.zeros(8),)
-    known, plain = (JUDGE(s, DELTA, -s.known.energy, slope, nothing) for s in (doubted, segment))
+    known, plain = (JUDGE(s, DELTA, -s.known.energy, slope, nothing, nothing) for s in (doubted, segment))
     covariance = np.asarray(segment.known.covariance)[:6, :6]
     delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
     for found, times in ((plain, 1.0), (known, 2.0)):
@@ -128,8 +143,22 @@ def test_without_a_rest_the_prior_decides():
     segment = eqx.tree_at(lambda s: s.arrival, known_segment(1.0), jnp.zeros((10, 10)))
     found = judge(segment, DELTA)
     np.testing.assert_allclose(found.identified, 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.arrival, 0.0, atol=1e-12)
+    assert found.rank == 0
     *_, of_sum = dense(segment)
     np.testing.assert_allclose(found.gap_sd[0], of_sum, rtol=1e-4)
+
+
+def test_the_rest_sees_turn_and_velocity_in_the_plane_of_the_bar():
+    """About y in the plane of x and z: three directions; of a gap that no rest follows, none."""
+    recording, truth = bar(0, gyr_rail=7.5)
+    whole = segments_table(estimate(recording, load_config(None, method="map", **BAR)))
+    assert list(whole["rank"]) == [3] and list(whole["seen"]) == ["att_y, vel_x, vel_z"]
+    last = replace(recording, rest=truth.rest & (truth.time < 0.8))
+    open_end = segments_table(estimate(last, load_config(None, method="map", **BAR)))
+    assert list(open_end["rank"]) == [0] and list(open_end["seen"]) == [""]
+    other = segments_table(estimate(recording, load_config(None, method="direct", **BAR)))
+    assert other["rank"].isna().all() and other["seen"].isna().all()
 
 
 def test_intervals_of_the_bar_cover_its_truth():

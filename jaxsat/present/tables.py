@@ -10,6 +10,8 @@ from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import CHANNELS
 
 AXES = ("x", "y", "z")
+ARRIVAL = ("att_x", "att_y", "att_z", "vel_x", "vel_y", "vel_z")
+"""What a rest sees of the motion before it."""
 
 
 def _axes(prefix: str, suffix: str = "") -> list[str]:
@@ -111,7 +113,10 @@ def segments_table(estimate: Estimate) -> pd.DataFrame:
     Columns: `segment` (its number, as in the trajectory), `start` and `end` (s), `saturated` (values that saturate in
     it), `length` (m, horizontal, from the rest before to the rest after), `climb` (m), their `*_sd`, and `status` of
     its search as in the gaps' table. Lengths are empty where no rest precedes or follows, their sd also where heights
-    of rests are used.
+    of rests are used. Method map says what the rest after it decides of what was lost: `rank`, in how many directions
+    (of at most six) it removes more than a hundredth of the variance under the signal prior, and `seen`, by what:
+    attitude or velocity on arrival, along those axes of the navigation frame about or along which it removes most of
+    the prior's sd, and those where a tenth as much.
     """
     segments, time = estimate.segments, estimate.recording.time
     way, covariance = displacements(estimate)
@@ -123,6 +128,11 @@ def segments_table(estimate: Estimate) -> pd.DataFrame:
     start = np.maximum(segments.departure + 1, 0)
     saturated = total[segments.arrival] - total[start]
     words = np.where(saturated == 0, Status.NOTHING_TO_DO.name.lower(), _status_words(estimate))
+    fills = estimate.fills
+    judged = np.isfinite(fills.arrival).all(axis=1)
+    kinds = fills.arrival.reshape(-1, 2, 3)
+    much = (kinds > 0.1 * kinds.max(axis=2, keepdims=True)).reshape(-1, 6) & (fills.rank > 0)[:, None]
+    seen = [", ".join(np.array(ARRIVAL)[row]) for row in much]
     return pd.DataFrame(
         {
             "segment": np.arange(len(segments)),
@@ -133,6 +143,8 @@ def segments_table(estimate: Estimate) -> pd.DataFrame:
             "length_sd": np.sqrt(np.maximum(spread[0], 0.0)),
             "climb": way[:, 2],
             "climb_sd": np.sqrt(np.maximum(spread[1], 0.0)),
+            "rank": pd.Series(fills.rank, dtype="Int64").where(judged),
+            "seen": pd.Series(seen, dtype="string").where(judged),
             "status": pd.array(words, dtype="string"),
         }
     )

@@ -55,6 +55,10 @@ class Fills(eqx.Module):
     """Of the sum over the gap that a filled value lies in; NaN where the method does not say."""
     identified: Float[np.ndarray, "N 6"]
     """Share of the variance of that sum that the rests removed; NaN where the method does not say."""
+    rank: Int[np.ndarray, "S"]
+    """Of each segment: `Uncertainty.rank`, and 0 for methods without uncertainty."""
+    arrival: Float[np.ndarray, "S 6"]
+    """Of each segment: `Uncertainty.arrival`, and nan."""
     at_bound: Bool[np.ndarray, "N 6"]
     """Values where the bound decided, not the data."""
     inflated: Bool[np.ndarray, "N 6"]
@@ -83,6 +87,8 @@ class Fills(eqx.Module):
             sd=np.zeros(shape),
             gap_sd=np.full(shape, np.nan),
             identified=np.full(shape, np.nan),
+            rank=np.zeros(count, int),
+            arrival=np.full((count, 6), np.nan),
             at_bound=np.zeros(shape, bool),
             inflated=np.zeros(shape, bool),
             status=np.full(count, int(Status.NOTHING_TO_DO)),
@@ -112,6 +118,7 @@ class Fills(eqx.Module):
         if (known := found.uncertainty) is not None:
             self.sd[sample, channel], self.gap_sd[sample, channel] = known.sd[real], known.gap_sd[real]
             self.identified[sample, channel] = known.identified[real]
+            self.rank[segments], self.arrival[segments] = known.rank, known.arrival
         self.status[segments] = found.solution.status
         self.cost_before[segments], self.cost_after[segments] = found.cost_before, found.solution.value
         self.residual[segments], self.iterations[segments] = (

@@ -125,7 +125,7 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
 
     # f(0), and the curvature at the start; both from one compiled evaluation.
     first, back = jax.vjp(search.delta, search.start)
-    values, columns = jax.lax.map(
+    values, columns, effects = jax.lax.map(
         lambda delta: value_and_root(delta, condensed, gravity), jnp.stack([jnp.zeros_like(first), first])
     )
     before = values[0]
@@ -180,6 +180,8 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
         at_bound=at_bound,
         uncertainty=None
         if known is None
-        else uncertainty(segment, delta, solution.value, solution.gradient, solution.columns),
+        else uncertainty(
+            segment, delta, solution.value, solution.gradient, solution.columns, tuple(e[1] for e in effects)
+        ),
         inflated=jnp.zeros_like(real) if known is None else known.harmful,
     )

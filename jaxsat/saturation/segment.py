@@ -299,18 +299,19 @@ def _pulled(
 
 def value_and_root(
     delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]
-) -> tuple[Float[Array, ""], tuple[Float[Array, "m"], ...]]:
-    """f(δ) of Eq. 18, and the columns of A with A Aᵀ its Gauss-Newton Hessian."""
+) -> tuple[Float[Array, ""], tuple[Float[Array, "m"], ...], tuple[Float[Array, "m"], ...]]:
+    """f(δ) of Eq. 18, columns of A with A Aᵀ its Gauss-Newton Hessian, and what each δ does to [θ, v] at arrival."""
     motion = _pass(condensed, delta)
     at = _arrive(condensed, motion, gravity)
     inner = _inner(condensed, motion, at)
-    return inner.value, _root(condensed, motion, at, inner)
+    effect = _effect(condensed, motion, at)
+    return inner.value, _root(effect, inner), cast(tuple[Array, ...], effect.entries())
 
 
 def value_gradient_root(
     delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, "m"], tuple[Float[Array, "m"], ...]]:
-    """`value_and_root`, with the gradient of f in between."""
+    """f(δ), its gradient, and the columns of A as of `value_and_root`."""
     inner, columns = _evaluated_once(delta, condensed, gravity)
     return inner.value, jax.grad(_pulled)(delta, condensed, gravity, inner), columns
 
@@ -327,7 +328,7 @@ def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple
         motion = _pass(condensed, delta)
         at = _arrive(condensed, motion, gravity)
         inner = _inner(condensed, motion, at)
-        return carry[0] + 1, (inner, _root(condensed, motion, at, inner))
+        return carry[0] + 1, (inner, _root(_effect(condensed, motion, at), inner))
 
     shapes = jax.eval_shape(evaluate, (jnp.asarray(0), None))
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -335,10 +336,13 @@ def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple
     return jax.lax.while_loop(lambda carry: carry[0] < times, evaluate, blank)[1]
 
 
-def _root(
-    condensed: Condensed, motion: Passage, at: _Arrival, inner: _Inner
-) -> tuple[Float[Array, "m"], ...]:
-    """Columns of A: the effect of each value on [θ, v] at arrival times `_Inner.root`.
+def _root(effect: Matrix, inner: _Inner) -> tuple[Float[Array, "m"], ...]:
+    """Columns of A: the effect of each value on [θ, v] at arrival times `_Inner.root`."""
+    return cast(tuple[Array, ...], (inner.root.T @ effect).entries())
+
+
+def _effect(condensed: Condensed, motion: Passage, at: _Arrival) -> Matrix:
+    """Of each value on [θ, v] at arrival.
 
     A unit error of a rate turns θ by T e and pushes v by −[V×]T e, V being what its own sample still adds after
     its middle and all that follows it; one of a specific force pushes v by T e. The pull of a height row is
@@ -353,8 +357,7 @@ def _root(
     V = Vector(*lever[:, condensed.element])
     theta = [jnp.where(rate, a, 0.0) for a in unit]
     speed = [jnp.where(rate, a, b) for a, b in zip(unit.cross(V), unit, strict=True)]
-    effect = Matrix.column((*theta, *speed)) * (condensed.sign * condensed.period[condensed.element])
-    return cast(tuple[Array, ...], (inner.root.T @ effect).entries())
+    return Matrix.column((*theta, *speed)) * (condensed.sign * condensed.period[condensed.element])
 
 
 def objective(delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]) -> Float[Array, ""]:

@@ -12,14 +12,16 @@ data's variance is scaled by as much: the a posteriori variance factor of geodes
 import equinox as eqx
 import jax.numpy as jnp
 from jax.scipy.stats import norm
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxsat.inertial.dense import solve_positive
+from jaxsat.inertial.dense import eigh, solve_positive
 from jaxsat.saturation.segment import Segment
 
 # ½ χ² of six directions is expected of the energy that is left at the mode. As if that had been seen once before:
 # one segment alone says little about its scale.
 EXPECTED = 3.0
+# Share of the prior's variance along a direction of δ that must be removed for it to count.
+LEAST_SEEN = 0.01
 
 
 class Uncertainty(eqx.Module):
@@ -31,6 +33,11 @@ class Uncertainty(eqx.Module):
     """Of the sum of δ over the gap that the value lies in (its unit; times the period that is the impulse's)."""
     identified: Float[Array, "m"]
     """Share of the prior's variance of that sum which the rests removed: 0 where the prior alone decides."""
+    rank: Int[Array, ""]
+    """In how many directions of δ the rests say anything, six at most and 0 where no rest follows: eigenvalues of the
+    data's Hessian in the prior's metric above `LEAST_SEEN`."""
+    arrival: Float[Array, "6"]
+    """What the rests removed of the prior's sd of [θ, v] on arrival (rad, m/s)."""
 
 
 def uncertainty(
@@ -39,10 +46,11 @@ def uncertainty(
     value: Float[Array, ""],
     slope: Float[Array, "m"],
     columns: tuple[Float[Array, "m"], ...],
+    effects: tuple[Float[Array, "m"], ...],
 ) -> Uncertainty:
     """At the mode δ of a segment that has a signal prior.
 
-    value, slope: of f(δ) + ½ δᵀΩδ + bᵀδ there; columns: of A.
+    value, slope: of f(δ) + ½ δᵀΩδ + bᵀδ there; columns: of A; effects: what each δ does to [θ, v] on arrival.
     """
     known = segment.known
     assert known is not None, "the signal prior was gathered"
@@ -67,6 +75,9 @@ def uncertainty(
 
     gap_before = variance(before)
     share = 1.0 - variance(after) / jnp.where(gap_before > 0.0, gap_before, 1.0)
+    strength, _ = eigh(A.T @ seen / factor)
+    moved = jnp.stack(effects, axis=1)
+    removed = jnp.einsum("ik,ij,jk->k", moved, before - after, moved)
     sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
     wider = widened(centre, sd, segment.bound) / sd
     gap_sd = jnp.sqrt(jnp.maximum(variance(after * wider[:, None] * wider[None]), 1e-300))
@@ -76,6 +87,8 @@ def uncertainty(
         sd=jnp.where(real, jnp.where(known.harmful, jnp.sqrt(known.variance), of_value), 0.0),
         gap_sd=jnp.where(real, of_sum, 0.0),
         identified=jnp.where(real, share, 0.0),
+        rank=jnp.sum(strength > LEAST_SEEN),
+        arrival=jnp.sqrt(jnp.maximum(removed, 0.0)),
     )
 
 
