@@ -176,7 +176,7 @@ def plan(path: Path, tracks: Tracks, title: str = "", size: tuple[float, float] 
     panel.set(xlabel="x (m)", ylabel="y (m)")
     # Limits give way, not the box: it keeps its place in the layout.
     panel.set_aspect("equal", adjustable="datalim")
-    panel.set_title("; ".join(filter(None, [title, "bar: start, markers: last positions"])), fontsize=8)
+    panel.set_title("\n".join(filter(None, [title, "bar: start, markers: last positions"])), fontsize=8)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     save(figure, path)
 
