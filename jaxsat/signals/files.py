@@ -122,6 +122,7 @@ def read_table(source: Source, names: tuple[str, ...], header_lines: int) -> dic
                 skip_blank_lines=False,
                 skipinitialspace=True,
                 low_memory=False,
+                float_precision="round_trip",
             )
     except UnicodeDecodeError:
         raise source.fail("the text holds bytes that are not UTF-8; save it again as UTF-8.") from None
