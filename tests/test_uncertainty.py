@@ -18,20 +18,21 @@ from jaxsat.pipeline import estimate
 from jaxsat.present.tables import gaps_table, segments_table
 from jaxsat.saturation.prior import Known
 from jaxsat.saturation.segment import condense, value_and_root, value_gradient_root
-from jaxsat.saturation.uncertainty import EXPECTED, LEAST_SEEN, truncated_deviation, uncertainty
+from jaxsat.saturation.uncertainty import CREDIT, LEAST_SEEN, truncated_deviation, uncertainty
 
 COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
 
 
 @jax.jit
-def judge(segment, delta, value=EXPECTED):
-    """value: of what is left at δ; as much as is expected, unless it is said."""
+def judge(segment, delta, left=0.0):
+    """left: of f(δ) there; nothing, unless it is said."""
     known = segment.known
     condensed = condense(segment)
     _, slope, _ = value_gradient_root(delta, condensed, problems.GRAVITY)
     _, columns, effects = value_and_root(delta, condensed, problems.GRAVITY)
-    slope = slope + known.slope + known.precision @ delta
-    return uncertainty(segment, delta, value - known.energy, slope, columns, effects)
+    pull = known.precision @ delta
+    value = left + delta @ (known.slope + 0.5 * pull)
+    return uncertainty(segment, delta, value, slope + known.slope + pull, columns, effects)
 
 
 def known_segment(scale: float):
@@ -41,9 +42,7 @@ def known_segment(scale: float):
     precision[:6, :6] = (root @ root.T + np.eye(6)) * scale
     covariance = jnp.asarray(np.linalg.inv(precision))
     variance, harmful = jnp.diagonal(covariance), jnp.zeros(8, bool)
-    prior = Known(
-        jnp.asarray(precision), jnp.zeros(8), jnp.asarray(0.5), covariance, jnp.ones(8), variance, harmful
-    )
+    prior = Known(jnp.asarray(precision), jnp.zeros(8), covariance, jnp.ones(8), variance, harmful)
     segment = build(False)
     gaps = jnp.array([0, 0, 1, 2, 3, 4, 7, 7])
     return eqx.tree_at(lambda s: (s.known, s.gap), segment, (prior, gaps), is_leaf=lambda x: x is None)
@@ -111,13 +110,17 @@ def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
     assert found.rank == rank(segment)
 
 
-def test_where_prior_and_data_disagree_the_data_are_believed_less():
-    """Their variance is scaled by what is left at the mode, one more motion having fitted as expected."""
+def test_data_that_leave_much_unexplained_are_believed_less():
+    """Their variance is scaled by what is left at the mode, over the directions that δ does not take up."""
     segment = known_segment(1e-2)
-    alike, agreed = judge(segment, DELTA), judge(segment, DELTA, 0.0)
-    np.testing.assert_array_equal(agreed.gap_sd, alike.gap_sd)
+    alike = judge(segment, DELTA)
+    _, _, columns = COLUMNS(DELTA, condense(segment), problems.GRAVITY)
+    A = np.stack(columns, axis=1)[:6]
+    taken = np.linalg.eigvalsh(A.T @ np.linalg.solve(np.asarray(segment.known.precision)[:6, :6], A))
+    free = np.sum(1.0 / (1.0 + taken))
+    np.testing.assert_array_equal(judge(segment, DELTA, 0.5 * free).gap_sd, alike.gap_sd)
     for factor in (2.0, 5.0):
-        found = judge(segment, DELTA, (2.0 * factor - 1.0) * EXPECTED)
+        found = judge(segment, DELTA, 0.5 * (factor * (free + CREDIT) - CREDIT))
         before, after, sd, of_sum = dense(segment, factor)
         np.testing.assert_allclose(found.sd[:6], sd, rtol=1e-4)
         np.testing.assert_allclose(found.gap_sd[0], of_sum, rtol=1e-4)
@@ -130,7 +133,7 @@ def test_hidden_peaks_that_were_far_off_widen_what_is_known():
     segment = known_segment(1.0)
     doubted = eqx.tree_at(lambda s: s.known.doubt, segment, jnp.full(8, 2.0))
     slope, nothing = jnp.zeros(8), 6 * (jnp.zeros(8),)
-    known, plain = (JUDGE(s, DELTA, -s.known.energy, slope, nothing, nothing) for s in (doubted, segment))
+    known, plain = (JUDGE(s, DELTA, jnp.zeros(()), slope, nothing, nothing) for s in (doubted, segment))
     covariance = np.asarray(segment.known.covariance)[:6, :6]
     delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
     for found, times in ((plain, 1.0), (known, 2.0)):

@@ -147,8 +147,6 @@ class Known(eqx.Module):
     """Ω."""
     slope: Float[Array, "m"]
     """b."""
-    energy: Float[Array, ""]
-    """Of the prior at δ = 0, its least being zero."""
     covariance: Float[Array, "m m"]
     """Ω⁻¹."""
     doubt: Float[Array, "m"]
@@ -217,11 +215,9 @@ def of_values(
     excess = jnp.where(real, jnp.sum(nearness * prior.excess[channel], axis=1), 1.0)
     harmful = real & prior.harmful[channel, jnp.round(place).astype(int)]
     variance = excess * jnp.diagonal(covariance) + jnp.where(harmful, mean**2, 0.0)
-    slope = -precision @ mean
     return Known(
         precision=precision,
-        slope=slope,
-        energy=-0.5 * slope @ mean,
+        slope=-precision @ mean,
         covariance=covariance,
         doubt=jnp.sqrt(excess),
         variance=jnp.where(real, variance, 0.0),

@@ -5,8 +5,9 @@ directions (attitude and velocity on arrival). A value lies beyond its rail and 
 distribution is that Gaussian's marginal, cut off there; an sd is about the value reported, the mode.
 
 The noise of the data is that of the sensor; what scale errors of the sensor, its mounting or a foot that rolls do to
-attitude and velocity on arrival is not in it. It shows where prior and data disagree more than both allow, and the
-data's variance is scaled by as much: the a posteriori variance factor of geodesy, the Birge ratio of metrology.
+attitude and velocity on arrival is not in it. It shows in what the data leave unexplained at the mode, and their
+variance is scaled by as much: the a posteriori variance factor of geodesy, 2 f(δ) over the directions that δ did not
+take up (MacKay 1992, "Bayesian interpolation", the noise level by the evidence).
 """
 
 import equinox as eqx
@@ -17,9 +18,8 @@ from jaxtyping import Array, Float, Int
 from jaxsat.inertial.dense import eigh, solve_positive
 from jaxsat.saturation.segment import Segment
 
-# ½ χ² of six directions is expected of the energy that is left at the mode. As if that had been seen once before:
-# one segment alone says little about its scale.
-EXPECTED = 3.0
+# As if in so many directions more as much had been left as expected: one motion alone says little about its scale.
+CREDIT = 3.0
 # Share of the prior's variance along a direction of δ that must be removed for it to count.
 LEAST_SEEN = 0.01
 
@@ -57,11 +57,14 @@ def uncertainty(
     A, one = jnp.stack(columns, axis=1), jnp.eye(len(columns))
     # The centre of the Gaussian that was searched: where a limit holds δ, it lies beyond it.
     seen = known.covariance @ A
-    centre = delta - known.covariance @ slope + seen @ solve_positive(one + A.T @ seen, seen.T @ slope)
+    strength = A.T @ seen
+    centre = delta - known.covariance @ slope + seen @ solve_positive(one + strength, seen.T @ slope)
+    free = jnp.trace(solve_positive(one + strength, one))
 
     before = known.covariance * known.doubt[:, None] * known.doubt[None]
     seen = before @ A
-    factor = jnp.maximum((value + known.energy + EXPECTED) / (2.0 * EXPECTED), 1.0)
+    left = value - delta @ (known.slope + 0.5 * known.precision @ delta)
+    factor = jnp.maximum((2.0 * left + CREDIT) / (free + CREDIT), 1.0)
     after = before - seen @ solve_positive(factor * one + A.T @ seen, seen.T)
 
     real = segment.bound > 0.0
@@ -75,7 +78,7 @@ def uncertainty(
 
     gap_before = variance(before)
     share = 1.0 - variance(after) / jnp.where(gap_before > 0.0, gap_before, 1.0)
-    strength, _ = eigh(A.T @ seen / factor)
+    strengths, _ = eigh(A.T @ seen / factor)
     moved = jnp.stack(effects, axis=1)
     removed = jnp.einsum("ik,ij,jk->k", moved, before - after, moved)
     sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
@@ -87,7 +90,7 @@ def uncertainty(
         sd=jnp.where(real, jnp.where(known.harmful, jnp.sqrt(known.variance), of_value), 0.0),
         gap_sd=jnp.where(real, of_sum, 0.0),
         identified=jnp.where(real, share, 0.0),
-        rank=jnp.sum(strength > LEAST_SEEN),
+        rank=jnp.sum(strengths > LEAST_SEEN),
         arrival=jnp.sqrt(jnp.maximum(removed, 0.0)),
     )
 
