@@ -18,20 +18,20 @@ from jaxsat.pipeline import estimate
 from jaxsat.present.tables import gaps_table, segments_table
 from jaxsat.saturation.prior import Known
 from jaxsat.saturation.segment import condense, value_and_root, value_gradient_root
-from jaxsat.saturation.uncertainty import CREDIT, LEAST_SEEN, truncated_deviation, uncertainty
+from jaxsat.saturation.uncertainty import CREDIT, LEAST_SEEN, own_misfit, truncated_deviation, uncertainty
 
 COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
 
 
 @jax.jit
 def judge(segment, delta, left=0.0):
-    """left: of f(δ) there; nothing, unless it is said."""
+    """left: of f(δ) there, beyond what the rest costs by itself; nothing, unless it is said."""
     known = segment.known
     condensed = condense(segment)
     _, slope, _ = value_gradient_root(delta, condensed, problems.GRAVITY)
     _, columns, effects = value_and_root(delta, condensed, problems.GRAVITY)
     pull = known.precision @ delta
-    value = left + delta @ (known.slope + 0.5 * pull)
+    value = left + own_misfit(segment.arrival) + delta @ (known.slope + 0.5 * pull)
     return uncertainty(segment, delta, value, slope + known.slope + pull, columns, effects)
 
 
@@ -126,6 +126,19 @@ def test_data_that_leave_much_unexplained_are_believed_less():
         np.testing.assert_allclose(found.gap_sd[0], of_sum, rtol=1e-4)
         assert found.identified[0] == pytest.approx(1.0 - after / before, abs=1e-9)
         assert found.identified[0] < alike.identified[0]
+
+
+def test_what_a_rest_costs_by_itself_is_the_least_over_all_arrivals():
+    """Two directions are told by their sum only, as tilt and a turned gravity are."""
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(10, 12))
+    root[6] = 0.5 * root[1]
+    table = root @ root.T
+    free = root[[0, 1, 2, 3, 4, 5, 7, 8]].T
+    away = root[9] - free @ np.linalg.lstsq(free, root[9], rcond=None)[0]
+    found = jax.jit(own_misfit)(jnp.asarray(table))
+    assert found == pytest.approx(0.5 * away @ away, rel=1e-8)
+    assert jax.jit(own_misfit)(jnp.zeros((10, 10))) == 0.0
 
 
 def test_hidden_peaks_that_were_far_off_widen_what_is_known():

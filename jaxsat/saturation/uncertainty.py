@@ -63,7 +63,7 @@ def uncertainty(
 
     before = known.covariance * known.doubt[:, None] * known.doubt[None]
     seen = before @ A
-    left = value - delta @ (known.slope + 0.5 * known.precision @ delta)
+    left = value - delta @ (known.slope + 0.5 * known.precision @ delta) - own_misfit(segment.arrival)
     factor = jnp.maximum((2.0 * left + CREDIT) / (free + CREDIT), 1.0)
     after = before - seen @ solve_positive(factor * one + A.T @ seen, seen.T)
 
@@ -93,6 +93,17 @@ def uncertainty(
         rank=jnp.sum(strengths > LEAST_SEEN),
         arrival=jnp.sqrt(jnp.maximum(removed, 0.0)),
     )
+
+
+def own_misfit(arrival: Float[Array, "10 10"]) -> Float[Array, ""]:
+    """What the samples of a rest cost however the motion arrives: the least of ½ [x; 1]ᵀ Λ [x; 1] over attitude,
+    velocity and gravity."""
+    values, vectors = eigh(arrival[:9, :9])
+    along = vectors.T @ arrival[:9, 9]
+    # Turning about gravity is not seen, and a tilt not told from a turned gravity.
+    seen = values > 1e-12 * jnp.max(values)
+    gained = jnp.sum(jnp.where(seen, along**2 / jnp.where(seen, values, 1.0), 0.0))
+    return 0.5 * jnp.maximum(arrival[9, 9] - gained, 0.0)
 
 
 def widened(centre: Float[Array, "m"], sd: Float[Array, "m"], upper: Float[Array, "m"]) -> Float[Array, "m"]:
