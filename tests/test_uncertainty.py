@@ -16,9 +16,10 @@ from test_segment import DELTA, build
 from jaxsat.config import load_config
 from jaxsat.pipeline import estimate
 from jaxsat.present.tables import gaps_table, segments_table
+from jaxsat.saturation.arrival import own_misfit
 from jaxsat.saturation.prior import Known
 from jaxsat.saturation.segment import condense, value_and_root, value_gradient_root
-from jaxsat.saturation.uncertainty import CREDIT, LEAST_SEEN, own_misfit, truncated_deviation, uncertainty
+from jaxsat.saturation.uncertainty import CREDIT, LEAST_SEEN, truncated_deviation, uncertainty
 
 COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
 

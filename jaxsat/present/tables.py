@@ -10,8 +10,6 @@ from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import CHANNELS
 
 AXES = ("x", "y", "z")
-ARRIVAL = ("att_x", "att_y", "att_z", "vel_x", "vel_y", "vel_z")
-"""What a rest sees of the motion before it."""
 
 
 def _axes(prefix: str, suffix: str = "") -> list[str]:
@@ -115,8 +113,8 @@ def segments_table(estimate: Estimate) -> pd.DataFrame:
     its search as in the gaps' table. Lengths are empty where no rest precedes or follows, their sd also where heights
     of rests are used. Method map says what the rest after it decides of what was lost: `rank`, in how many directions
     (of at most six) it removes more than a hundredth of the variance under the signal prior, and `seen`, by what:
-    attitude or velocity on arrival, along those axes of the navigation frame about or along which it removes most of
-    the prior's sd, and those where a tenth as much.
+    attitude and velocity on arrival, about and along those axes of the navigation frame where it removes at least a
+    tenth of the sd that it removes on the axis where it removes most.
     """
     segments, time = estimate.segments, estimate.recording.time
     way, covariance = displacements(estimate)
@@ -132,7 +130,8 @@ def segments_table(estimate: Estimate) -> pd.DataFrame:
     judged = np.isfinite(fills.arrival).all(axis=1)
     kinds = fills.arrival.reshape(-1, 2, 3)
     much = (kinds > 0.1 * kinds.max(axis=2, keepdims=True)).reshape(-1, 6) & (fills.rank > 0)[:, None]
-    seen = [", ".join(np.array(ARRIVAL)[row]) for row in much]
+    names = np.array([*_axes("att"), *_axes("vel")])
+    seen = [", ".join(names[row]) for row in much]
     return pd.DataFrame(
         {
             "segment": np.arange(len(segments)),

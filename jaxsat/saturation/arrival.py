@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsat.inertial.dense import eigh
 from jaxsat.inertial.rotations import quat_multiply, quat_rotate, skew
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import Samples, sample_interval, sample_noise
@@ -63,3 +64,14 @@ def arrivals(
     blank = (jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.eye(6, 10), jnp.zeros((6, 6)), jnp.zeros((10, 10)))
     lanes = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(start), *x.shape)), blank)
     return jax.lax.fori_loop(0, longest, lambda k, c: jax.vmap(one)(c, start + k, end), lanes)[3]
+
+
+def own_misfit(arrival: Float[Array, "10 10"]) -> Float[Array, ""]:
+    """What the samples of a rest cost however the motion arrives: the least of ½ [x; 1]ᵀ Λ [x; 1] over attitude,
+    velocity and gravity."""
+    values, vectors = eigh(arrival[:9, :9])
+    along = vectors.T @ arrival[:9, 9]
+    # Turning about gravity is not seen, and a tilt not told from a turned gravity.
+    seen = values > 1e-12 * jnp.max(values)
+    gained = jnp.sum(jnp.where(seen, along**2 / jnp.where(seen, values, 1.0), 0.0))
+    return 0.5 * jnp.maximum(arrival[9, 9] - gained, 0.0)

@@ -6,8 +6,9 @@ distribution is that Gaussian's marginal, cut off there; an sd is about the valu
 
 The noise of the data is that of the sensor; what scale errors of the sensor, its mounting or a foot that rolls do to
 attitude and velocity on arrival is not in it. It shows in what the data leave unexplained at the mode, and their
-variance is scaled by as much: the a posteriori variance factor of geodesy, 2 f(δ) over the directions that δ did not
-take up (MacKay 1992, "Bayesian interpolation", the noise level by the evidence).
+variance is scaled by as much: the a posteriori variance factor of geodesy. It is twice what f(δ) exceeds the rest's
+own misfit, over the directions that δ did not take up (MacKay 1992, "Bayesian interpolation": the noise level by the
+evidence).
 """
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial.dense import eigh, solve_positive
+from jaxsat.saturation.arrival import own_misfit
 from jaxsat.saturation.segment import Segment
 
 # As if in so many directions more as much had been left as expected: one motion alone says little about its scale.
@@ -37,7 +39,7 @@ class Uncertainty(eqx.Module):
     """In how many directions of δ the rests say anything, six at most and 0 where no rest follows: eigenvalues of the
     data's Hessian in the prior's metric above `LEAST_SEEN`."""
     arrival: Float[Array, "6"]
-    """What the rests removed of the prior's sd of [θ, v] on arrival (rad, m/s)."""
+    """Root of the variance of [θ, v] on arrival (rad, m/s) under the prior that the rests removed."""
 
 
 def uncertainty(
@@ -50,7 +52,8 @@ def uncertainty(
 ) -> Uncertainty:
     """At the mode δ of a segment that has a signal prior.
 
-    value, slope: of f(δ) + ½ δᵀΩδ + bᵀδ there; columns: of A; effects: what each δ does to [θ, v] on arrival.
+    value, slope: of f(δ) + ½ δᵀΩδ + bᵀδ there; columns: of A; effects: what each δ does to [θ, v] on
+    arrival, wherever the search began.
     """
     known = segment.known
     assert known is not None, "the signal prior was gathered"
@@ -93,17 +96,6 @@ def uncertainty(
         rank=jnp.sum(strengths > LEAST_SEEN),
         arrival=jnp.sqrt(jnp.maximum(removed, 0.0)),
     )
-
-
-def own_misfit(arrival: Float[Array, "10 10"]) -> Float[Array, ""]:
-    """What the samples of a rest cost however the motion arrives: the least of ½ [x; 1]ᵀ Λ [x; 1] over attitude,
-    velocity and gravity."""
-    values, vectors = eigh(arrival[:9, :9])
-    along = vectors.T @ arrival[:9, 9]
-    # Turning about gravity is not seen, and a tilt not told from a turned gravity.
-    seen = values > 1e-12 * jnp.max(values)
-    gained = jnp.sum(jnp.where(seen, along**2 / jnp.where(seen, values, 1.0), 0.0))
-    return 0.5 * jnp.maximum(arrival[9, 9] - gained, 0.0)
 
 
 def widened(centre: Float[Array, "m"], sd: Float[Array, "m"], upper: Float[Array, "m"]) -> Float[Array, "m"]:
