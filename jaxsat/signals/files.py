@@ -112,6 +112,8 @@ def read_table(source: Source, names: tuple[str, ...], header_lines: int) -> dic
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
+            # From 3.1 on pandas reads digit for digit by itself and deprecates asking for it.
+            warnings.simplefilter("ignore", DeprecationWarning)
             frame = pd.read_csv(
                 source.path,
                 header=None,
