@@ -1,13 +1,16 @@
 """Float64, strict promotion, a persistent compilation cache, and the folder of real recordings."""
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
-# Compiling is most of the time of the tests, and a program without LLVM's optimisations is compiled in half of it.
-# Two devices, so that sweeps have something to spread over.
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=2"
-)
+# Compiling is most of the time of the tests: programs without LLVM's optimisations, made by the older of the two
+# emitters that jaxlib has on a CPU, are compiled in a third of it. Unknown flags end the process, so the second is for the jaxlib
+# that is known to have it. Two devices, so that sweeps have something to spread over.
+_QUICK = "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=2"
+if version("jaxlib").startswith("0.10."):
+    _QUICK += " --xla_cpu_use_fusion_emitters=false"
+os.environ.setdefault("XLA_FLAGS", _QUICK)
 
 import jax
 import pytest
