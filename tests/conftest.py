@@ -5,12 +5,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 # Compiling is most of the time of the tests: programs without LLVM's optimisations, made by the older of the two
-# emitters that jaxlib has on a CPU, are compiled in a third of it. Unknown flags end the process, so the second is for the jaxlib
-# that is known to have it. Two devices, so that sweeps have something to spread over.
-_QUICK = "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=2"
-if version("jaxlib").startswith("0.10."):
-    _QUICK += " --xla_cpu_use_fusion_emitters=false"
-os.environ.setdefault("XLA_FLAGS", _QUICK)
+# emitters that jaxlib has for CPUs, are compiled in a third of it. A flag that is not known ends the process, so that
+# is for the jaxlib that knows it. Two devices, so that sweeps have something to spread over.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=2"
+    + " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10."),
+)
 
 import jax
 import pytest
