@@ -21,7 +21,7 @@ from jaxsat.inertial.orientation import (
     orientation,
     start_at_rest,
 )
-from jaxsat.inertial.programs import make_room
+from jaxsat.inertial.programs import compiled, make_room
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.preparation import LEFT_OFFSET_SD, MOVING_START_SD, MOVING_START_TILT_SD, given_gains
 from jaxsat.saturation.interpolation import interpolate_gaps
@@ -232,7 +232,7 @@ def _padded(
     return values, periods, trusted, rest
 
 
-@eqx.filter_jit
+@compiled
 def _start_in_motion(signal, period, trusted, rest, guess: Start, gains: Gains) -> Start:
     """Attitude and offset at the first sample from a run to the end and back: by then the guess is forgotten."""
     forward = orientation(signal, period, trusted, guess, gains, rest=rest)
@@ -241,7 +241,7 @@ def _start_in_motion(signal, period, trusted, rest, guess: Start, gains: Gains) 
     return Start(back.q_nb[0], end.offset - back.integral[0], guess.gravity)
 
 
-_filter = eqx.filter_jit(orientation)
+_filter = compiled(orientation)
 _angles = jax.jit(jax.vmap(euler_angles))
 
 
@@ -264,7 +264,7 @@ def _smooth(
     return q_nb, np.sqrt(variance)
 
 
-@eqx.filter_jit
+@compiled
 def _bounded(*problem):
     found = bounded_attitude(*problem)
     variance = jnp.diagonal(found.covariance, axis1=1, axis2=2)

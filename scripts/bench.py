@@ -30,6 +30,7 @@ from peers.smoothers import cuthbert_smoother, dynamax_smoother, linear_model, w
 from problems import OPTIONS, Batch, bars, direct, run_direct, strapdown_seconds, walk, with_rests
 
 from jaxsat import Sensor, load_config, simulate
+from jaxsat.inertial.programs import compiled
 from jaxsat.inertial.smoother import smooth_about
 from jaxsat.pipeline import _smooth, estimate
 from jaxsat.preparation import prepare
@@ -57,7 +58,7 @@ def objective_vs_strapdown() -> Iterator[Row]:
 
     condensed = jax.jit(jax.vmap(segment))(jax.tree.map(jnp.asarray, batch.trials))
     delta = jnp.ones((256, batch.sizes.values))
-    evaluate = jax.jit(jax.vmap(lambda d, c, g: value_gradient_root(d, c, g)[:2], in_axes=(0, 0, None)))
+    evaluate = compiled(jax.vmap(lambda d, c, g: value_gradient_root(d, c, g)[:2], in_axes=(0, 0, None)))
     bare = strapdown_seconds()
     seconds = shortest(lambda: evaluate(delta, condensed, jnp.asarray(GRAVITY)), 50)
     bare = min(bare, strapdown_seconds())
@@ -150,7 +151,7 @@ def paper_way_speedup() -> Iterator[Row]:
     batch = Batch(prepared.trial, segments.departure, segments.arrival, segments.rest_end)
     tight = eqx.tree_at(lambda o: o.tolerance, OPTIONS, jnp.asarray(1e-5))
     solve = partial(direct, batch=batch, whole=False, options=tight, sure=True)
-    run, trial = jax.jit(solve), jax.tree.map(jnp.asarray, prepared.trial)
+    run, trial = compiled(solve), jax.tree.map(jnp.asarray, prepared.trial)
     found, values = run(trial)
     real = np.asarray(values.sample[0]) < len(recording)
     delta = np.asarray(found.delta[0])[real]
@@ -168,7 +169,7 @@ def smoother_vs_peers() -> Iterator[Row]:
     model = linear_model(trials)
     gravity = jnp.asarray(GRAVITY)
 
-    @jax.jit
+    @compiled
     def ours():
         return jax.vmap(
             lambda reference, samples, rows, prior: smooth_about(

@@ -11,6 +11,7 @@ from peers import shortest
 from peers.strapdown import bare_trials, numba_strapdown
 
 from jaxsat import Sensor, load_config, simulate
+from jaxsat.inertial.programs import compiled
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import prepare
@@ -97,7 +98,7 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
 
 
 def run_direct(batch: Batch, whole: bool) -> Callable:
-    solve = jax.jit(jax.vmap(lambda trial: direct(trial, batch, whole)))
+    solve = compiled(jax.vmap(lambda trial: direct(trial, batch, whole)))
     trials = jax.device_put(jax.tree.map(jnp.asarray, batch.trials))
     return lambda: solve(trials)
 

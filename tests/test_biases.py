@@ -55,7 +55,7 @@ def dense_cost(reference, samples: Samples, rows: Rows, covariance):
     """J of the offsets of all steps about a fixed reference, by one dense Gaussian of all states."""
     intervals = sample_intervals(samples.signal, samples.period)
     at = reference.q_nb[:-1]
-    transitions = np.asarray(jax.vmap(error_transition)(at, intervals))
+    transitions = np.asarray(jax.vmap(lambda q, i: error_transition(q, i).forth(jnp.eye(9)))(at, intervals))
     noises = np.asarray(jax.vmap(sample_noise)(at, samples.signal, samples.period, samples.variance))
     C = np.zeros((9 * (N + 1), 9 * (N + 1)))
     C[:9, :9] = covariance

@@ -57,7 +57,7 @@ def propagated():
     def step(carry, inputs):
         q, covariance = carry
         interval, signal, period, variance = inputs
-        F = error_transition(q, interval)
+        F = error_transition(q, interval).forth(jnp.eye(9))
         covariance = F @ covariance @ F.T + sample_noise(q, signal, period, variance)
         return ((Quaternion.of(q) @ Quaternion.of(interval.rotation)).stack(), covariance), None
 

@@ -54,7 +54,7 @@ def dense(reference, samples, rows, prior, prior_covariance, whole=False):
     root[0, :, :9] = vectors * np.sqrt(np.maximum(values, 0.0))
     for k in range(N):
         start, interval = at(reference, k), at(intervals, k)
-        Phi = np.asarray(error_transition(start.q_nb, interval))
+        Phi = np.asarray(error_transition(start.q_nb, interval).forth(jnp.eye(9)))
         offset = error_between(advance(start, interval, problems.GRAVITY), at(reference, k + 1))
         noise = sample_noise(start.q_nb, samples.signal[k], samples.period[k], samples.variance[k])
         values, vectors = np.linalg.eigh(noise)

@@ -104,7 +104,13 @@ def test_error_transition_is_the_jacobian_of_the_strapdown():
     def moved(error):
         return error_between(advance(add_error(state, error), interval, problems.GRAVITY), end)
 
-    same(jax.jacfwd(moved)(jnp.zeros(9)), error_transition(state.q_nb, interval))
+    transition, eye = error_transition(state.q_nb, interval), jnp.eye(9)
+    same(jax.jacfwd(moved)(jnp.zeros(9)), transition.forth(eye))
+    same(transition.back(eye), transition.forth(eye).T)
+    # Without position, nothing else changes.
+    here = np.r_[0:3, 6:9]
+    same(transition.forth(jnp.eye(6)), transition.forth(eye)[here][:, here])
+    same(transition.back(jnp.eye(6)), transition.back(eye)[here][:, here])
 
 
 def test_error_transition_is_the_papers_body_frame_model():
@@ -112,7 +118,7 @@ def test_error_transition_is_the_papers_body_frame_model():
     state, _ = problems.departure()
     gyr, acc, T = SAMPLES.signal[3, :3], SAMPLES.signal[3, 3:], SAMPLES.period[3]
     interval = row(INTERVALS, 3)
-    Phi = error_transition(state.q_nb, interval)
+    Phi = error_transition(state.q_nb, interval).forth(jnp.eye(9))
     start = quat_to_matrix(state.q_nb)
     end = quat_to_matrix(advance(state, interval, problems.GRAVITY).q_nb)
     eye, zero = np.eye(3), np.zeros((3, 3))

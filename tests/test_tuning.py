@@ -85,7 +85,8 @@ def test_the_misfit_is_that_of_one_dense_gaussian():
     np.testing.assert_allclose(samples.variance[:n], np.repeat(sd[None] ** 2, n, axis=0))
     reference = strapdown(samples.signal, samples.period, prior, gravity)
     at = reference.q_nb[:-1]
-    transitions = jax.vmap(error_transition)(at, sample_intervals(samples.signal, samples.period))
+    intervals = sample_intervals(samples.signal, samples.period)
+    transitions = jax.vmap(lambda q, i: error_transition(q, i).forth(jnp.eye(9)))(at, intervals)
     noises = jax.vmap(sample_noise)(at, samples.signal, samples.period, samples.variance)
     C = np.zeros((9 * n, 9 * n))
     C[:9, :9] = covariance

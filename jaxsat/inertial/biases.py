@@ -53,11 +53,11 @@ def bias_quadratic(
         shift, covariance = kalman.predict(
             mean[:, 0],
             covariance,
-            transition,
+            transition.forth,
             offset,
             sample_noise(state.q_nb, sample.signal, sample.period, sample.variance),
         )
-        moved = transition @ mean[:, 1:] + jnp.concatenate([rate, force], axis=1)
+        moved = transition.forth(mean[:, 1:]) + jnp.concatenate([rate, force], axis=1)
         return (jnp.concatenate([shift[:, None], moved], axis=1), covariance, total), None
 
     carry = (jnp.zeros((9, 7)), prior_covariance, jnp.zeros((7, 7)))

@@ -28,6 +28,15 @@ _solve_positive = one_by_one(
 _eigh = one_by_one(lambda matrix: tuple(jnp.linalg.eigh(matrix)))
 
 
+def product(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:
+    """a @ b of matrices with few columns and rows, term by term.
+
+    XLA makes a library call of each product in a batch: for 64 lanes of 6 × 6 that is five times slower.
+    """
+    terms = [a[:, j, None] * b[j][None] for j in range(a.shape[1])]
+    return sum(terms[1:], terms[0])
+
+
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """x of matrix @ x = right with a positive definite matrix."""
     return _solve_positive(matrix, right)

@@ -5,19 +5,11 @@ process noise and exactly known initial states are ordinary cases. The backward 
 Bryson-Frazier smoother (Bierman 1973), here for scalar rows.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-
-
-def product(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:
-    """a @ b of small matrices, term by term.
-
-    XLA makes a library call of each product in a batch: for 64 lanes of 6 × 6 that is five times slower. Where larger
-    ones feed much else it is the other way round, since what is fused is computed again for each use.
-    """
-    terms = [a[:, j, None] * b[j][None] for j in range(a.shape[1])]
-    return sum(terms[1:], terms[0])
 
 
 class Row(eqx.Module):
@@ -50,16 +42,20 @@ def update_row(
     return mean + gain * innovation, covariance - jnp.outer(gain, column), cost, row
 
 
+Linear = Callable[[Float[Array, "n k"]], Float[Array, "n k"]]
+"""A matrix, by what it does to columns."""
+
+
 def predict(
     mean: Float[Array, "n"],
     covariance: Float[Array, "n n"],
-    transition: Float[Array, "n n"],
+    transition: Linear,
     offset: Float[Array, "n"],
     noise: Float[Array, "n n"],
 ) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
     """x' = Φ x + offset + w, cov(w) = noise."""
-    spread = transition @ covariance @ transition.T + noise
-    return transition @ mean + offset, 0.5 * (spread + spread.T)
+    spread = transition(transition(covariance).T) + noise
+    return transition(mean[:, None])[:, 0] + offset, 0.5 * (spread + spread.T)
 
 
 class Adjoint(eqx.Module):
@@ -79,10 +75,10 @@ def adjoint_row(adjoint: Adjoint, index: int, row: Row) -> tuple[Adjoint, Float[
     return Adjoint(adjoint.gradient.at[index].add(-multiplier), curvature), multiplier
 
 
-def adjoint_transition(adjoint: Adjoint, transition: Float[Array, "n n"]) -> Adjoint:
-    """The adjoint at the start of a transition."""
-    curvature = transition.T @ adjoint.curvature @ transition
-    return Adjoint(transition.T @ adjoint.gradient, 0.5 * (curvature + curvature.T))
+def adjoint_transition(adjoint: Adjoint, back: Linear) -> Adjoint:
+    """The adjoint at the start of a transition; back: Φᵀ."""
+    curvature = back(back(adjoint.curvature).T)
+    return Adjoint(back(adjoint.gradient[:, None])[:, 0], 0.5 * (curvature + curvature.T))
 
 
 def condition_on_future(

@@ -1,4 +1,4 @@
-"""Compiled functions whose traces outlive the process, and which do not crowd it.
+"""Compiled functions: with what options, whose traces outlive the process, and which do not crowd it.
 
 JAX keeps compiled programs on disk, but to know which one it needs it traces the Python code anew in each process:
 most of what a later run of the command line would wait for. `stored_jit` keeps the traces too.
@@ -9,7 +9,7 @@ import pickle
 import platform
 import tempfile
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -20,6 +20,14 @@ import numpy as np
 from jax.core import Tracer
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+# Of the two emitters that jaxlib 0.10 has for CPUs the newer one, its default, takes about twice as long to compile
+# these programs of many small operations, and what it makes is slower. An option that is not known is an error, so it
+# is for the jaxlib that knows it.
+OPTIONS = {"xla_cpu_use_fusion_emitters": False} if version("jaxlib").startswith("0.10.") else {}
+
+compiled = partial(eqx.filter_jit, compiler_options=OPTIONS)
+"""`equinox.filter_jit` with the options that suit this package."""
 
 # Of the memory maps that Linux allows a process so many may be taken before compiled programs are forgotten.
 MOST_MAPS = 0.5
@@ -51,19 +59,21 @@ def make_room() -> None:
 
 
 def stored_jit(function: F) -> F:
-    """`equinox.filter_jit` of a function of positional arguments that returns arrays; its trace is kept.
+    """`compiled` of a function of positional arguments that returns arrays; its trace is kept.
 
     A trace is for the code of the package, the versions of what it runs on, the kind of device, and the arguments'
     shapes, types and whatever is no array. One that cannot be read is made anew; where none can be made or written it
     goes without.
     """
-    jitted = eqx.filter_jit(function)
+    jitted = compiled(function)
 
     @wraps(function)
     def call(*args):
         arrays, rest = eqx.partition(args, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic))
         leaves, structure = jax.tree.flatten(arrays)
-        if _folder is None or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return function(*args)
+        if _folder is None:
             return jitted(*args)
         kinds = [jax.typeof(leaf) for leaf in leaves]
         name = f"{function.__module__}.{function.__qualname__}"
@@ -95,7 +105,7 @@ def _surroundings() -> str:
 
 def _program(exported: Any, skeleton: Any) -> Callable[..., Any]:
     """A callable of a trace: of the leaves of its arguments, returning the tree that the function does."""
-    run, structure = jax.jit(exported.call), jax.tree.structure(skeleton)
+    run, structure = jax.jit(exported.call, compiler_options=OPTIONS), jax.tree.structure(skeleton)
     return lambda *leaves: jax.tree.unflatten(structure, run(*leaves))
 
 

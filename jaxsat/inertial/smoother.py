@@ -123,10 +123,9 @@ def closed_loop(
         mean, covariance, cost, _ = update_rows(nothing, covariance, state, row)
         unseen = jnp.zeros(9 - size, mean.dtype)
         state = add_error(state, jnp.concatenate([mean[:3], unseen, mean[3:]]))
-        transition = part(error_transition(state.q_nb, interval))
+        transition = error_transition(state.q_nb, interval).forth
         noise = part(sample_noise(state.q_nb, sample.signal, sample.period, sample.variance))
-        spread = kalman.product(kalman.product(transition, covariance), transition.T) + noise
-        predicted = 0.5 * (spread + spread.T)
+        _, predicted = kalman.predict(nothing, covariance, transition, nothing, noise)
         return (advance(state, interval, gravity), predicted), ((state, covariance), cost)
 
     intervals = sample_intervals(samples.signal, samples.period)
@@ -171,7 +170,7 @@ def smooth_about(
         predicted = kalman.predict(
             mean,
             covariance,
-            error_transition(state.q_nb, interval),
+            error_transition(state.q_nb, interval).forth,
             offset,
             sample_noise(state.q_nb, sample.signal, sample.period, sample.variance),
         )
@@ -179,7 +178,7 @@ def smooth_about(
 
     def backward(adjoint, inputs):
         state, interval, mean, covariance, row = inputs
-        adjoint = kalman.adjoint_transition(adjoint, error_transition(state.q_nb, interval))
+        adjoint = kalman.adjoint_transition(adjoint, error_transition(state.q_nb, interval).back)
         smoothed = kalman.condition_on_future(mean, covariance, adjoint)
         multiplier = None
         for index, done in reversed(list(zip(_observed(rows, 9), row, strict=True))):
@@ -249,7 +248,7 @@ def displacement_covariance(
         after = jnp.where(begin & ~(moves[:, None] & moves[None]), 0.0, after)
         noise = sample_noise(state.q_nb, sample.signal, sample.period, sample.variance)
         _, predicted = kalman.predict(
-            jnp.zeros(9), after, error_transition(state.q_nb, interval), jnp.zeros(9), noise
+            jnp.zeros(9), after, error_transition(state.q_nb, interval).forth, jnp.zeros(9), noise
         )
         return predicted, known
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsat.inertial.components import Quaternion, Vector
+from jaxsat.inertial.dense import product
 from jaxsat.inertial.preintegration import attitude_prefixes
 from jaxsat.inertial.rotations import (
     quat_conjugate,
@@ -72,19 +73,43 @@ def sample_intervals(signal: Float[Array, "N 6"], period: Float[Array, "N"]) -> 
     return jax.vmap(sample_interval)(signal, period)
 
 
-def error_transition(q_nb: Float[Array, "4"], interval: Interval) -> Float[Array, "9 9"]:
+class ErrorTransition(eqx.Module):
+    """Φ = [[I, 0, 0], [A, I, τI], [B, 0, I]] of [θ, r, v], or [[I, 0], [B, I]] of [θ, v], by what it does."""
+
+    position: Float[Array, "3 3"]
+    """A."""
+    velocity: Float[Array, "3 3"]
+    """B."""
+    duration: Float[Array, ""]
+    """τ (s)."""
+
+    def forth(self, x: Float[Array, "s k"]) -> Float[Array, "s k"]:
+        """Φ x."""
+        moved = x[-3:] + product(self.velocity, x[:3])
+        if len(x) == 6:
+            return jnp.concatenate([x[:3], moved])
+        return jnp.concatenate([x[:3], x[3:6] + product(self.position, x[:3]) + self.duration * x[6:], moved])
+
+    def back(self, x: Float[Array, "s k"]) -> Float[Array, "s k"]:
+        """Φᵀ x."""
+        turned = x[:3] + product(self.velocity.T, x[-3:])
+        if len(x) == 6:
+            return jnp.concatenate([turned, x[3:]])
+        return jnp.concatenate(
+            [turned + product(self.position.T, x[3:6]), x[3:6], x[6:] + self.duration * x[3:6]]
+        )
+
+
+def error_transition(q_nb: Float[Array, "4"], interval: Interval) -> ErrorTransition:
     """Transition Φ of the navigation-frame error [θ, r, v] over an interval that starts at attitude q_nb.
 
     θ is a rotation vector: R_true = exp([θ×]) R̂. It equals the paper's body-frame model (Eq. 8-9) with
     q̄_e = ½ R_bn θ, but the attitude error does not rotate: Φ = [[I,0,0], [−[W×],I,τI], [−[V×],0,I]].
     """
-    eye, zero = jnp.eye(3, dtype=q_nb.dtype), jnp.zeros((3, 3), q_nb.dtype)
-    return jnp.block(
-        [
-            [eye, zero, zero],
-            [-skew(quat_rotate(q_nb, interval.position)), eye, interval.duration * eye],
-            [-skew(quat_rotate(q_nb, interval.velocity)), zero, eye],
-        ]
+    return ErrorTransition(
+        position=-skew(quat_rotate(q_nb, interval.position)),
+        velocity=-skew(quat_rotate(q_nb, interval.velocity)),
+        duration=interval.duration,
     )
 
 
@@ -99,8 +124,8 @@ def sample_noise(
     First order in the paper's Eq. 9: a rate turns θ by T, a specific force moves v by T and r by ½T².
     """
     R = quat_to_matrix(quat_multiply(q_nb, quat_exp(0.5 * period * signal[:3]))) * period
-    turned = (R * variance[None, :3]) @ R.T
-    pushed = (R * variance[None, 3:]) @ R.T
+    turned = product(R * variance[None, :3], R.T)
+    pushed = product(R * variance[None, 3:], R.T)
     zero, half = jnp.zeros_like(turned), 0.5 * period
     return jnp.block(
         [

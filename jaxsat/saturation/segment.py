@@ -321,9 +321,10 @@ def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple
 
     The inner minimum is a thousand operations for a few numbers. XLA would fuse them into the loops over samples
     that use these numbers, and repeat them for each sample; what a loop returns is stored. That the loop is run
-    once must not be known when it is compiled.
+    once must not be known when it is compiled. (On a CPU `optimization_barrier` is gone before anything is fused.)
     """
 
+    @jax.jit
     def evaluate(carry):
         motion = _pass(condensed, delta)
         at = _arrive(condensed, motion, gravity)
@@ -332,7 +333,7 @@ def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple
 
     shapes = jax.eval_shape(evaluate, (jnp.asarray(0), None))
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    times = jnp.where(jnp.isnan(delta[0]), 2, 1)
+    times = jnp.where(jnp.isnan(gravity), 2, 1)
     return jax.lax.while_loop(lambda carry: carry[0] < times, evaluate, blank)[1]
 
 

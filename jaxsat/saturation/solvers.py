@@ -177,6 +177,7 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
     if known is not None:
         # The prior tells apart what the data do not, so a full step may be tried at once.
         first = least
+    linearise = jax.jit(linearise)  # so that it is traced once
     rank = len(jax.eval_shape(linearise, box.start)[2])
 
     def proceed(carry):

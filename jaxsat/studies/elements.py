@@ -11,6 +11,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
+from jaxsat.inertial.programs import compiled
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.preparation import Prepared
@@ -125,7 +126,7 @@ def run_elements(
     return jax.tree.map(np.asarray, found)
 
 
-@eqx.filter_jit
+@compiled
 def _scores(
     cases: Case,
     rails,
@@ -247,6 +248,6 @@ def _smooth_path(trial: Trial, signal, variance, relinearisations) -> Float[Arra
     return smoothed.state.position[:-1]
 
 
-@eqx.filter_jit
+@compiled
 def _standard(trial: Trial, relinearisations) -> Float[Array, "N 3"]:
     return _smooth_path(jax.tree.map(jnp.asarray, trial), trial.signal, trial.variance, relinearisations)

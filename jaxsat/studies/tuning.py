@@ -19,6 +19,7 @@ from jaxsat.config import Config, Noise
 from jaxsat.errors import InputError
 from jaxsat.inertial import kalman
 from jaxsat.inertial.orientation import Direction, Estimate, Gains, Start, orientation, up_in_body
+from jaxsat.inertial.programs import compiled
 from jaxsat.inertial.smoother import Rows, smooth, update_rows
 from jaxsat.inertial.strapdown import (
     NavState,
@@ -90,7 +91,7 @@ def tune_gains(
         kp, ki, tau = jnp.exp(logs)
         return Gains(kp, ki, tau, initial.gate, initial.limit)
 
-    gradient = eqx.filter_jit(
+    gradient = compiled(
         value_and_gradient(lambda logs: inclination_loss(trials, gains(logs), estimate, direction))
     )
     first = jnp.log(jnp.stack([initial.kp, initial.ki, initial.tau]))
@@ -183,7 +184,7 @@ def rest_misfit(trial: NoiseTrial, noise: Float[Array, "3"]) -> Float[Array, ""]
         state = add_error(state, error)
         transition = error_transition(state.q_nb, interval)
         spread = sample_noise(state.q_nb, sample.signal, sample.period, sample.variance)
-        _, covariance = kalman.predict(error, covariance, transition, error, spread)
+        _, covariance = kalman.predict(error, covariance, transition.forth, error, spread)
         return (advance(state, interval, gravity), covariance, total), None
 
     intervals = sample_intervals(samples.signal, samples.period)
@@ -234,7 +235,7 @@ def tune_noise(
     loss = position_loss if against_truth else rest_misfit
     count = len(trials) if against_truth else sum(int(np.sum(t.trial.rows.rest)) for t in trials)
     with jax.enable_x64(True):
-        gradient = eqx.filter_jit(value_and_gradient(lambda logs, trial: loss(trial, jnp.exp(logs))))
+        gradient = compiled(value_and_gradient(lambda logs, trial: loss(trial, jnp.exp(logs))))
 
         def together(logs: Logs) -> tuple[Array, Array]:
             values, slopes = zip(*(gradient(logs, trial) for trial in trials), strict=True)

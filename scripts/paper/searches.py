@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from scipy.stats import norm
 
 from jaxsat.config import Config
+from jaxsat.inertial.programs import compiled
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import estimate, search_options
@@ -124,7 +125,7 @@ def problem_of(recording: Recording, config: Config, method: str) -> tuple[Prepa
     return prepared, Problem(segment, condensed, gravity, options.tolerance, options.max_iterations)
 
 
-@partial(jax.jit, static_argnames="learned")
+@compiled
 def _gathered(trial: Trial, departure, arrival, table, learned: bool) -> tuple[Segment, Condensed]:
     trial = jax.tree.map(jnp.asarray, trial)
     filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
@@ -134,7 +135,7 @@ def _gathered(trial: Trial, departure, arrival, table, learned: bool) -> tuple[S
     return segment, condense(segment)
 
 
-@jax.jit
+@compiled
 def _ends(trial: Trial, signals: Float[Array, "B N 6"], variance, last) -> Float[Array, "B 3"]:
     """Where the smoother ends with each filled signal."""
 
@@ -174,7 +175,7 @@ def iterations(chosen: Settings, out: Path) -> None:
 
                 return solve(told, problem.box(jnp.zeros_like(problem.segment.bound)))
 
-            jax.block_until_ready(jax.jit(search)(problem))
+            jax.block_until_ready(compiled(search)(problem))
             jax.effects_barrier()
             rows += [
                 {"method": method, "solver": name, "evaluation": k, "cost": cost}
@@ -190,7 +191,7 @@ def iterations(chosen: Settings, out: Path) -> None:
     drawing.descents(out / "descent", table)
 
 
-@jax.jit
+@compiled
 def _search(problems: Problem, first: Float[Array, "S B m"]):
     """Every problem from every start."""
 
