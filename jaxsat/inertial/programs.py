@@ -9,7 +9,7 @@ import pickle
 import platform
 import tempfile
 from collections.abc import Callable
-from functools import cache, partial, wraps
+from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -26,14 +26,16 @@ F = TypeVar("F", bound=Callable[..., Any])
 # is for the jaxlib that knows it.
 OPTIONS = {"xla_cpu_use_fusion_emitters": False} if version("jaxlib").startswith("0.10.") else {}
 
-compiled = partial(eqx.filter_jit, compiler_options=OPTIONS)
-"""`equinox.filter_jit` with the options that suit this package."""
-
 # Of the memory maps that Linux allows a process so many may be taken before compiled programs are forgotten.
 MOST_MAPS = 0.5
 
 _folder: Path | None = None
 _loaded: dict[str, Callable[..., Any] | None] = {}
+
+
+def compiled(function: F) -> F:
+    """`equinox.filter_jit` with the options that suit this package."""
+    return cast(F, eqx.filter_jit(function, compiler_options=OPTIONS))
 
 
 def keep_traces(folder: Path | None) -> None:
