@@ -100,13 +100,8 @@ def linear_model(trials: WalkingTrials) -> LinearModel:
         turn, push = jnp.linalg.cholesky(Q[:, :3, :3]), jnp.linalg.cholesky(Q[:, 6:, 6:])
         half, zero = 0.5 * samples.period[:, None, None], jnp.zeros_like(turn)
         root = jnp.block([[turn, zero], [zero, half * push], [zero, push]])
-        return (
-            jax.vmap(lambda q, i: error_transition(q, i).forth(jnp.eye(9)))(start.q_nb, intervals),
-            Q,
-            root,
-            -start.velocity,
-            rest,
-        )
+        F = jax.vmap(lambda q, i: error_transition(q, i).forth(jnp.eye(9)))(start.q_nb, intervals)
+        return F, Q, root, -start.velocity, rest
 
     F, Q, root, y, mask = jax.vmap(one)(trials.samples, trials.reference, trials.rows.rest)
     H = jnp.eye(9)[jnp.array(VELOCITY)]
