@@ -20,11 +20,15 @@ import numpy as np
 from jax.core import Tracer
 
 F = TypeVar("F", bound=Callable[..., Any])
+Options = dict[str, bool | int]
+"""Of XLA, by the names of its flags."""
 
 # Of the two emitters that jaxlib 0.10 has for CPUs the newer one, its default, takes about twice as long to compile
 # these programs of many small operations, and what it makes is slower. An option that is not known is an error, so it
 # is for the jaxlib that knows it.
-OPTIONS = {"xla_cpu_use_fusion_emitters": False} if version("jaxlib").startswith("0.10.") else {}
+OPTIONS: Options = {"xla_cpu_use_fusion_emitters": False} if version("jaxlib").startswith("0.10.") else {}
+# For what runs for a moment and is compiled for long: without LLVM's optimisations.
+UNOPTIMISED: Options = {**OPTIONS, "xla_backend_optimization_level": 0}
 
 # Of the memory maps that Linux allows a process so many may be taken before compiled programs are forgotten.
 MOST_MAPS = 0.5
@@ -33,9 +37,9 @@ _folder: Path | None = None
 _loaded: dict[str, Callable[..., Any] | None] = {}
 
 
-def compiled(function: F) -> F:
+def compiled(function: F, options: Options = OPTIONS) -> F:
     """`equinox.filter_jit` with the options that suit this package."""
-    return cast(F, eqx.filter_jit(function, compiler_options=OPTIONS))
+    return cast(F, eqx.filter_jit(function, compiler_options=options))
 
 
 def keep_traces(folder: Path | None) -> None:
@@ -60,14 +64,14 @@ def make_room() -> None:
         jax.clear_caches()
 
 
-def stored_jit(function: F) -> F:
+def stored_jit(function: F, options: Options = OPTIONS) -> F:
     """`compiled` of a function of positional arguments that returns arrays; its trace is kept.
 
     A trace is for the code of the package, the versions of what it runs on, the kind of device, and the arguments'
     shapes, types and whatever is no array. One that cannot be read is made anew; where none can be made or written it
     goes without.
     """
-    jitted = compiled(function)
+    jitted = compiled(function, options)
 
     @wraps(function)
     def call(*args):
@@ -87,7 +91,7 @@ def stored_jit(function: F) -> F:
             def whole(*given):
                 return function(*eqx.combine(jax.tree.unflatten(structure, given), rest))
 
-            _loaded[key] = _read(path) or _trace(whole, kinds, path)
+            _loaded[key] = _read(path, options) or _trace(whole, kinds, path, options)
         program = _loaded[key]
         return jitted(*args) if program is None else program(*leaves)
 
@@ -105,24 +109,26 @@ def _surroundings() -> str:
     return " ".join([code.hexdigest(), platform.python_version(), jax.default_backend(), *versions])
 
 
-def _program(exported: Any, skeleton: Any) -> Callable[..., Any]:
+def _program(exported: Any, skeleton: Any, options: Options) -> Callable[..., Any]:
     """A callable of a trace: of the leaves of its arguments, returning the tree that the function does."""
-    run, structure = jax.jit(exported.call, compiler_options=OPTIONS), jax.tree.structure(skeleton)
+    run, structure = jax.jit(exported.call, compiler_options=options), jax.tree.structure(skeleton)
     return lambda *leaves: jax.tree.unflatten(structure, run(*leaves))
 
 
-def _read(path: Path) -> Callable[..., Any] | None:
+def _read(path: Path, options: Options) -> Callable[..., Any] | None:
     from jax import export
 
     try:
         serialised, skeleton = pickle.loads(path.read_bytes())
-        return _program(export.deserialize(serialised), skeleton)
+        return _program(export.deserialize(serialised), skeleton, options)
     # Whatever is wrong with it, a trace can be made anew.
     except Exception:
         return None
 
 
-def _trace(function: Callable[..., Any], kinds: list[Any], path: Path) -> Callable[..., Any] | None:
+def _trace(
+    function: Callable[..., Any], kinds: list[Any], path: Path, options: Options
+) -> Callable[..., Any] | None:
     from jax import export
 
     structure = None
@@ -148,4 +154,4 @@ def _trace(function: Callable[..., Any], kinds: list[Any], path: Path) -> Callab
         Path(file.name).replace(path)
     except OSError:
         pass
-    return _program(exported, skeleton)
+    return _program(exported, skeleton, options)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.biases import estimate_biases
-from jaxsat.inertial.programs import stored_jit
+from jaxsat.inertial.programs import UNOPTIMISED, stored_jit
 from jaxsat.inertial.smoother import Filtered, closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
@@ -187,7 +187,7 @@ def trial_biases(
 _bias = stored_jit(trial_biases)
 filter_recording = stored_jit(filter_trial)
 _solve = stored_jit(solve_segments)
-_prior = stored_jit(signal_prior)
+_prior = stored_jit(signal_prior, UNOPTIMISED)
 
 
 @stored_jit

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsat import Config, simulate
+from jaxsat.inertial.dense import eigh
 from jaxsat.inertial.smoother import VELOCITY, Rows
 from jaxsat.inertial.strapdown import (
     NavState,
@@ -89,6 +90,12 @@ def walking_trials(trials: int, count: int) -> WalkingTrials:
 
 
 @jax.jit
+def _root(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """B with B Bᵀ = matrix."""
+    values, vectors = eigh(matrix)
+    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None]
+
+
 def linear_model(trials: WalkingTrials) -> LinearModel:
     """The problem that `smooth_about` solves about the reference, in matrices."""
 
@@ -97,7 +104,7 @@ def linear_model(trials: WalkingTrials) -> LinearModel:
         intervals = sample_intervals(samples.signal, samples.period)
         Q = jax.vmap(sample_noise)(start.q_nb, samples.signal, samples.period, samples.variance)
         # cov(w) of a velocity and its position is one matrix V times [[¼T², ½T], [½T, 1]].
-        turn, push = jnp.linalg.cholesky(Q[:, :3, :3]), jnp.linalg.cholesky(Q[:, 6:, 6:])
+        turn, push = (jax.vmap(_root)(Q[:, part, part]) for part in (slice(0, 3), slice(6, 9)))
         half, zero = 0.5 * samples.period[:, None, None], jnp.zeros_like(turn)
         root = jnp.block([[turn, zero], [zero, half * push], [zero, push]])
         F = jax.vmap(lambda q, i: error_transition(q, i).forth(jnp.eye(9)))(start.q_nb, intervals)
