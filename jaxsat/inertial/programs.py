@@ -20,7 +20,7 @@ import numpy as np
 from jax.core import Tracer
 
 F = TypeVar("F", bound=Callable[..., Any])
-Options = dict[str, bool | int]
+Options = dict[str, Any]
 """Of XLA, by the names of its flags."""
 
 # Of the two emitters that jaxlib 0.10 has for CPUs the newer one, its default, takes about twice as long to compile
@@ -39,7 +39,8 @@ _loaded: dict[str, Callable[..., Any] | None] = {}
 
 def compiled(function: F, options: Options = OPTIONS) -> F:
     """`equinox.filter_jit` with the options that suit this package."""
-    return cast(F, eqx.filter_jit(function, compiler_options=options))
+    # What `jax.jit` takes besides is passed on, though its signature does not say so.
+    return cast(Any, eqx.filter_jit)(function, compiler_options=options)
 
 
 def keep_traces(folder: Path | None) -> None:
