@@ -89,6 +89,17 @@ def test_gauss_newton_takes_the_shortest_of_the_steps_that_the_data_cannot_tell_
     np.testing.assert_allclose(found.x, np.linalg.pinv(A[:3]) @ A[:3] @ np.ones(8), atol=1e-6)
 
 
+def test_gauss_newton_traces_what_it_minimises_once():
+    """Tracing a segment takes seconds."""
+    traced = []
+    fun = least_squares(lambda x: traced.append(x) or jnp.asarray(A[:3]) @ x)
+    box = Box(jnp.ones(8), jnp.full(8, -1.0), jnp.ones(8), jnp.ones(8), jnp.asarray(1e-8), 200)
+    jax.jit(lambda box: projected_gauss_newton(fun, box).x)(box)
+    alone = len(traced)
+    jax.eval_shape(fun, jnp.ones(8))
+    assert 0 < alone == len(traced) - alone
+
+
 @pytest.mark.parametrize("damping", [1e-6, 1e-2, 10.0])
 def test_box_step_is_the_solution_of_the_bounded_quadratic_problem(damping):
     gradient = A.T @ B

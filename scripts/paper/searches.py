@@ -118,7 +118,7 @@ def problem_of(recording: Recording, config: Config, method: str) -> tuple[Prepa
     segments = prepared.segments
     table = arrival_table(prepared.trial, segments)[0]
     segment, condensed = _gathered(
-        prepared.trial, int(segments.departure[0]), int(segments.arrival[0]), table, method == "map"
+        prepared.trial, segments.departure[:1], segments.arrival[:1], table, method == "map"
     )
     options = search_options(config, method)
     gravity = jnp.asarray(prepared.trial.gravity)
@@ -127,7 +127,7 @@ def problem_of(recording: Recording, config: Config, method: str) -> tuple[Prepa
 
 @compiled
 def _gathered(trial: Trial, departure, arrival, table, learned: bool) -> tuple[Segment, Condensed]:
-    trial = jax.tree.map(jnp.asarray, trial)
+    trial, departure, arrival = jax.tree.map(jnp.asarray, trial), departure[0], arrival[0]
     filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
     state, covariance, _ = jax.tree.map(lambda x: x[departure], filtered)
     known = signal_prior(trial) if learned else None

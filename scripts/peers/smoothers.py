@@ -89,13 +89,13 @@ def walking_trials(trials: int, count: int) -> WalkingTrials:
     )
 
 
-@jax.jit
 def _root(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """B with B Bᵀ = matrix."""
     values, vectors = eigh(matrix)
     return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None]
 
 
+@jax.jit
 def linear_model(trials: WalkingTrials) -> LinearModel:
     """The problem that `smooth_about` solves about the reference, in matrices."""
 
