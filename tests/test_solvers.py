@@ -92,12 +92,15 @@ def test_gauss_newton_takes_the_shortest_of_the_steps_that_the_data_cannot_tell_
 def test_gauss_newton_traces_what_it_minimises_once():
     """Tracing a segment takes seconds."""
     traced = []
-    fun = least_squares(lambda x: traced.append(x) or jnp.asarray(A[:3]) @ x)
+    fun = least_squares(lambda x: jnp.asarray(A[:3]) @ x)
     box = Box(jnp.ones(8), jnp.full(8, -1.0), jnp.ones(8), jnp.ones(8), jnp.asarray(1e-8), 200)
-    jax.jit(lambda box: projected_gauss_newton(fun, box).x)(box)
-    alone = len(traced)
-    jax.eval_shape(fun, jnp.ones(8))
-    assert 0 < alone == len(traced) - alone
+
+    def told(x):
+        traced.append(x)
+        return fun(x)
+
+    jax.jit(lambda box: projected_gauss_newton(told, box).x)(box)
+    assert len(traced) == 1
 
 
 @pytest.mark.parametrize("damping", [1e-6, 1e-2, 10.0])
