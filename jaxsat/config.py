@@ -38,6 +38,11 @@ class Noise(_Section):
         max_length=6,
         description="density of each channel, gyr_x to acc_z, over that of its sensor",
     )
+    change: float = Field(
+        default=0.03,
+        ge=0,
+        description="sd of a value as a share of its sensor's change between neighbouring samples",
+    )
     rest_velocity_sd: float = Field(
         default=0.02, gt=0, description="sd of the velocity of a resting sensor (m/s)"
     )
@@ -100,15 +105,25 @@ class Smoother(_Section):
     """The whole-trial smoother."""
 
     relinearisations: int = Field(default=1, ge=0, le=20, description="Gauss-Newton steps after the first")
-    gyr_offset: Literal["first_rest", "none"] = Field(
-        default="first_rest", description="constant rate to remove"
+    gyr_offset: Literal["rests", "none"] = Field(
+        default="rests", description="constant rate to remove: what it reads at rests, or none"
     )
     gyr_bias_sd: float = Field(
-        default=0.0, ge=0, description="sd of the rate bias that map estimates (rad/s); 0: none"
+        default=0.0, ge=0, description="prior sd of a rate bias that motions tell (rad/s); 0: none"
     )
     acc_bias_sd: float = Field(
-        default=0.0, ge=0, description="sd of the accelerometer's bias that map estimates (m/s²); 0: none"
+        default=0.05, ge=0, description="prior sd of the accelerometer's bias (m/s²); 0: none"
     )
+    lever_sd: float = Field(
+        default=0.1,
+        ge=0,
+        description="prior sd of each axis of the lever from the sensor to the point that stands still (m); 0: none",
+    )
+
+    @property
+    def constants_sd(self) -> list[float]:
+        """Prior sd of what is constant in a recording (rad/s, m/s², m)."""
+        return [self.gyr_bias_sd] * 3 + [self.acc_bias_sd] * 3 + [self.lever_sd] * 3
 
 
 class Orientation(_Section):

@@ -9,9 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
+from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import stored_jit
 from jaxsat.inertial.smoother import (
     ActiveSet,
@@ -21,8 +22,14 @@ from jaxsat.inertial.smoother import (
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.preparation import prepare_and_filter, without_floor
-from jaxsat.saturation.compensate import Fills, compensate_parallel, compensate_sequential
+from jaxsat.preparation import prepare_recording, without_floor
+from jaxsat.saturation.compensate import (
+    FIRST_STEPS,
+    Fills,
+    calibrate_recording,
+    compensate_parallel,
+    compensate_sequential,
+)
 from jaxsat.saturation.layout import Trial, bucket, pad
 from jaxsat.saturation.methods import Compensation, Options
 from jaxsat.signals.rails import Gaps, Rails
@@ -60,6 +67,8 @@ class Estimate(eqx.Module):
     signal_sd: Float[np.ndarray, "N 6"]
     """sd of each value of `filled`: sensor noise, and where it was filled `Fills.sd`."""
     fills: Fills
+    calibration: Calibration
+    """Biases beside `gyr_offset`, and the lever, that the trajectory goes with."""
     standard_position: Float[np.ndarray, "N 3"]
     """Where the standard smoother, which ignores saturation, puts the sensor (m)."""
     cost: Float[np.ndarray, ""]
@@ -98,40 +107,54 @@ def estimate(
 def search_options(config: Config, method: str) -> Options:
     """How a compensating method searches."""
     chosen = config.saturation
-    bias_sd = np.repeat([config.smoother.gyr_bias_sd, config.smoother.acc_bias_sd], 3)
-    # A sensor of which no bias is wanted has one that is as good as known.
-    wanted = method == "map" and bool(bias_sd.any())
     return Options(
         cast(Compensation, method),
         chosen.solver,
         chosen.free_peak_time,
         jnp.asarray(chosen.max_iterations),
         jnp.asarray(chosen.tolerance),
-        jnp.asarray(np.maximum(bias_sd, 1e-9)) if wanted else None,
+        constants_sd(config),
     )
+
+
+def constants_sd(config: Config) -> Float[Array, "9"] | None:
+    """None where no constant is wanted."""
+    sd = config.smoother.constants_sd
+    return jnp.asarray(sd) if any(sd) else None
+
+
+def _calibrated(trial: Trial, extra: Float[np.ndarray, "N 6"], config: Config) -> Calibration:
+    """The constants that the rests of a recording tell, `extra` being the variance of what saturates."""
+    sd, none = constants_sd(config), Calibration.none()
+    if sd is None:
+        return none
+    return calibrate_recording(trial, trial.signal, extra, sd, FIRST_STEPS, none)
 
 
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
     clock = _Clock()
-    prepared, filtered = prepare_and_filter(recording, config)
+    prepared = prepare_recording(recording, config)
     trial, segments, gaps = prepared.trial, prepared.segments, prepared.gaps
     clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))
-    standard, floor = _smooth(trial, config)
-    smoothed, sure = standard, trial
+    searched = without_floor(trial, config)
+    unfilled = np.asarray(trial.unfilled_variance)
+    calibration = _calibrated(searched, np.zeros_like(unfilled), config)
+    sure = trial.calibrated(calibration)
+    standard, floor = _smooth(sure, config)
+    smoothed = standard
     clock.lap("smoother")
     if config.method != "standard" and len(gaps):
         options = search_options(config, config.method)
         report = partial(progress, "segments")
-        searched = without_floor(trial, config)
+        # Saturated values tell nothing of the sensors before they are filled.
+        given = searched, segments, options, _calibrated(searched, unfilled, config)
         if config.saturation.segments == "parallel":
-            fills = compensate_parallel(
-                searched, segments, options, config.saturation.sweeps, report, filtered
-            )
+            fills, calibration = compensate_parallel(*given, config.saturation.sweeps, report)
         else:
-            fills = compensate_sequential(searched, segments, options, report)
+            fills, calibration = compensate_sequential(*given, report)
         clock.lap("compensation")
-        filled = eqx.tree_at(lambda t: t.signal, trial, fills.unbiased)
+        filled = eqx.tree_at(lambda t: t.signal, trial, fills.signal).calibrated(calibration)
         path, sure = (
             eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
             for extra in (fills.slack, fills.variance)
@@ -173,6 +196,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         filled=filled,
         signal_sd=np.sqrt(variance),
         fills=fills,
+        calibration=jax.tree.map(np.asarray, calibration),
         standard_position=np.asarray(standard.state.position)[:n],
         cost=np.asarray(smoothed.cost),
         cost_standard=np.asarray(standard.cost),

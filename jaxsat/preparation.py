@@ -11,21 +11,19 @@ from jaxsat.errors import InputError
 from jaxsat.inertial.orientation import Gains, Start, backward
 from jaxsat.inertial.programs import make_room, stored_jit
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
-from jaxsat.inertial.smoother import Filtered, Rows
+from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
 from jaxsat.saturation.compensate import filter_recording
 from jaxsat.saturation.false_rests import false_rests
 from jaxsat.saturation.layout import Trial
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
-from jaxsat.signals.recording import Recording
-from jaxsat.signals.rests import Segments, find_rests, find_segments
+from jaxsat.signals.recording import Recording, sensor_changes
+from jaxsat.signals.rests import Segments, find_rests, find_segments, resting_rate
 from jaxsat.signals.support import find_support
 
 # Up to so long before its first rest (s) a recording's tilt is as well known as in it.
 LATEST_FIRST_REST = 1.0
-# A gyroscope offset is taken from a first rest of at least this length; a shorter one tells less than it costs.
-SHORTEST_OFFSET_REST = 1.0
 # sd of the unknown velocity of a sensor that does not start at rest (m/s), and of its tilt (rad), however long it
 # moves before its first rest: a round number above the PI controller's inclination errors in results/orientation.
 MOVING_START_SD = 3.0
@@ -52,11 +50,11 @@ class Prepared(eqx.Module):
 def prepare(recording: Recording, config: Config) -> Prepared:
     """All that is done to a recording before it is smoothed; raises `InputError` as `estimate` does."""
     with jax.enable_x64(True):
-        return prepare_and_filter(recording, config)[0]
+        return prepare_recording(recording, config)
 
 
-def prepare_and_filter(recording: Recording, config: Config) -> tuple[Prepared, Filtered]:
-    """And the filter pass over it, saturated values being free within their bounds."""
+def prepare_recording(recording: Recording, config: Config) -> Prepared:
+    """`prepare` where float64 is on already."""
     make_room()
     warnings = check(recording)
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
@@ -74,6 +72,7 @@ def prepare_and_filter(recording: Recording, config: Config) -> tuple[Prepared, 
     while True:
         trial, offset = _trial(recording, config, rest, sign)
         segments, searched = find_segments(rest), without_floor(trial, config)
+        # Saturated values may be anything within their bounds here.
         filtered = filter_recording(searched, trial.signal, trial.unfilled_variance)
         false = false_rests(searched, segments, filtered)
         if not false.any():
@@ -84,7 +83,7 @@ def prepare_and_filter(recording: Recording, config: Config) -> tuple[Prepared, 
                 f"the rest from {recording.time[start]:.2f} to {recording.time[end]:.2f} s is left out: the motions "
                 "before and after it say that the sensor moved."
             )
-    return Prepared(trial, offset, rails, rest, segments, find_gaps(sign), sign, warnings), filtered
+    return Prepared(trial, offset, rails, rest, segments, find_gaps(sign), sign, warnings)
 
 
 def without_floor(trial: Trial, config: Config) -> Trial:
@@ -108,13 +107,12 @@ def _trial(
     first = int(started[0])
     moving = np.flatnonzero(~rest[first:])
     first_rest = slice(first, first + int(moving[0]) if len(moving) else n)
-    length = first_rest.stop - first_rest.start
     # The first rest at a foot's first step includes its first stir: leave out its last tenth of a second.
     quiet = slice(first, max(first + 1, first_rest.stop - round(0.1 / T)))
 
     offset = np.zeros(3)
-    if config.smoother.gyr_offset == "first_rest" and length * T >= SHORTEST_OFFSET_REST:
-        offset = signal[quiet, :3].mean(axis=0)
+    if config.smoother.gyr_offset == "rests":
+        offset = resting_rate(signal[:, :3], rest, T)
     signal = signal - np.concatenate([offset, np.zeros(3)])
     up = signal[quiet, 3:].mean(axis=0)
     gravity = np.linalg.norm(up) if config.gravity == "auto" else float(config.gravity)
@@ -122,7 +120,8 @@ def _trial(
     # Density to per-sample variance; a value that was not measured may be anything the channel did.
     noise, limits = config.noise, config.saturation
     density = np.array(noise.densities)
-    variance = np.where(recording.missing, np.maximum(signal.var(axis=0), density**2 / T), density**2 / T)
+    plain = density**2 / T + (noise.change * sensor_changes(signal)) ** 2
+    variance = np.where(recording.missing, np.maximum(signal.var(axis=0), plain), plain)
 
     # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
     # controller of `orientation` where that is so long that its offset would do more than the controller errs.
@@ -152,6 +151,7 @@ def _trial(
         velocity_variance=jnp.full(n, noise.rest_velocity_sd**2),
         height=None if height is None else jnp.asarray(height),
         height_variance=jnp.full(n, config.height.sd**2),
+        velocity=jnp.zeros((n, 3)),
     )
     trial = Trial(
         signal=signal,

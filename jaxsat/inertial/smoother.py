@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial import kalman
 from jaxsat.inertial.dense import solve_positive
+from jaxsat.inertial.rotations import quat_rotate
 from jaxsat.inertial.strapdown import (
     Interval,
     NavState,
@@ -35,18 +36,27 @@ class Rows(eqx.Module):
     """What is known of the states without a sensor; state k is the start of sample k."""
 
     rest: Bool[Array, "*N"]
-    """Zero velocity at state k."""
+    """At state k the sensor rests: its velocity is known."""
     velocity_variance: Float[Array, "*N"]
     """Of each axis of that velocity (m²/s²)."""
     height: Bool[Array, "*N"] | None
     """Zero height at state k; None where heights are not used at all."""
     height_variance: Float[Array, "*N"]
     """Of that height (m²); zero makes it exact."""
+    velocity: Float[Array, "*N 3"] | None = None
+    """Velocity of a resting sensor in the body frame (m/s), where what it is fixed to turns about a point that stands
+    still; None where that is zero."""
 
     def marked(self, change: Callable[[Any], Any]) -> "Rows":
         """With the flags of rests and heights changed alike."""
         height = None if self.height is None else change(self.height)
-        return Rows(change(self.rest), self.velocity_variance, height, self.height_variance)
+        return Rows(change(self.rest), self.velocity_variance, height, self.height_variance, self.velocity)
+
+    def misfit(self, state: NavState) -> Float[Array, "3"]:
+        """What the velocity of one state lacks to be that of its rest, in the navigation frame (m/s)."""
+        if self.velocity is None:
+            return -state.velocity
+        return quat_rotate(state.q_nb, self.velocity) - state.velocity
 
 
 class Smoothed(eqx.Module):
@@ -75,7 +85,7 @@ def update_rows(
 ) -> tuple[Float[Array, "n"], Float[Array, "n n"], Float[Array, ""], list[kalman.Row]]:
     """The rows of one state on the error about the reference `state`."""
     cost, done = jnp.zeros_like(state.velocity[0]), []
-    known = [(-v, rows.velocity_variance, rows.rest) for v in state.velocity]
+    known = [(v, rows.velocity_variance, rows.rest) for v in rows.misfit(state)]
     if rows.height is not None:
         known.append((-state.position[2], rows.height_variance, rows.height))
     for index, row in zip(_observed(rows, len(mean)), known, strict=True):
@@ -294,7 +304,7 @@ def smooth_nonnegative(
     zero = jnp.zeros_like(rows.height_variance)
 
     def solve(active):
-        exact = Rows(rows.rest, rows.velocity_variance, active, zero)
+        exact = Rows(rows.rest, rows.velocity_variance, active, zero, rows.velocity)
         smoothed = smooth(samples, exact, prior, prior_covariance, gravity, relinearisations)
         low = smoothed.state.position[:-1, 2] < -tolerance
         assert smoothed.height_multiplier is not None

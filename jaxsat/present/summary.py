@@ -34,6 +34,7 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
     busy = fills.status != Status.NOTHING_TO_DO
     words = [Status(code).name.lower() for code in fills.status[busy]]
     floor = estimate.floor
+    constants, constants_sd = (x.tolist() for x in (estimate.calibration.constants, estimate.calibration.sd))
     return {
         "versions": versions(),
         "input": input_summary(estimate.recording, source),
@@ -53,8 +54,10 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
         "cost": {"before": float(estimate.cost_standard), "after": float(estimate.cost)},
         "gravity": float(estimate.gravity),
         "gyr_offset": estimate.gyr_offset.tolist(),
-        "bias": dict(zip(CHANNELS, fills.bias.tolist(), strict=True)),
-        "bias_sd": dict(zip(CHANNELS, fills.bias_sd.tolist(), strict=True)),
+        "bias": dict(zip(CHANNELS, constants[:6], strict=True)),
+        "bias_sd": dict(zip(CHANNELS, constants_sd[:6], strict=True)),
+        "lever": constants[6:],
+        "lever_sd": constants_sd[6:],
         "floor": None
         if floor is None
         else {

@@ -38,10 +38,13 @@ def arrivals(
         here = jnp.minimum(at, count - 1)
         signal, period, variance = (x[here] for x in (samples.signal, samples.period, samples.variance))
         rest = (at < end) & rows.rest[here]
+        moves = None if rows.velocity is None else quat_rotate(q, rows.velocity[here])
         for index in (3, 4, 5):
             column = P[:, index]
             weight = jnp.where(rest, 1.0 / (column[index] + rows.velocity_variance[here]), 0.0)
             innovation = -mean[index]
+            if moves is not None:
+                innovation = innovation.at[9].add(moves[index - 3])
             table = table + weight * jnp.outer(innovation, innovation)
             mean = mean + weight * jnp.outer(column, innovation)
             P = P - weight * jnp.outer(column, column)

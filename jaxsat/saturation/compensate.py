@@ -1,15 +1,14 @@
 """All segments of a recording, in parallel or one after the other (paper A, Section 5)."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxsat.inertial.biases import estimate_biases
+from jaxsat.inertial.calibration import Calibration, calibrate
 from jaxsat.inertial.programs import UNOPTIMISED, stored_jit
 from jaxsat.inertial.smoother import Filtered, closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
@@ -35,6 +34,8 @@ Progress = Callable[[int, int], None]
 
 # So many segments are solved at once; more would gain nothing on a CPU and wait for the slowest.
 LANES = 64
+# Gauss-Newton steps from no calibration: a third changes no digit that is reported.
+FIRST_STEPS = 2
 
 
 class Fills(eqx.Module):
@@ -45,10 +46,6 @@ class Fills(eqx.Module):
     """What a filled value adds to the sensor's noise, before rests are heard."""
     slack: Float[np.ndarray, "N 6"]
     """What it adds for the path that goes with the filled signal."""
-    bias: Float[np.ndarray, "6"]
-    """Of the sensors (rad/s, m/s²); zero where they are not estimated."""
-    bias_sd: Float[np.ndarray, "6"]
-    """Of these; zero where they are not estimated."""
     sd: Float[np.ndarray, "N 6"]
     """Of filled values: by `map` that of their posterior, by the others that of a value anywhere in its bounds."""
     gap_sd: Float[np.ndarray, "N 6"]
@@ -70,11 +67,6 @@ class Fills(eqx.Module):
     residual: Float[np.ndarray, "S"]
     iterations: Int[np.ndarray, "S"]
 
-    @property
-    def unbiased(self) -> Float[np.ndarray, "N 6"]:
-        """The filled signal without the biases."""
-        return self.signal - self.bias[None]
-
     @staticmethod
     def nothing(trial: Trial, count: int) -> "Fills":
         zeros, shape = np.zeros(count), trial.signal.shape
@@ -82,8 +74,6 @@ class Fills(eqx.Module):
             signal=np.array(trial.signal),
             variance=np.array(trial.unfilled_variance),
             slack=np.array(trial.unfilled_variance),
-            bias=np.zeros(6),
-            bias_sd=np.zeros(6),
             sd=np.zeros(shape),
             gap_sd=np.full(shape, np.nan),
             identified=np.full(shape, np.nan),
@@ -106,9 +96,7 @@ class Fills(eqx.Module):
         real = values.sample < len(trial.signal)
         sample, channel = values.sample[real], values.channel[real]
         self.signal[sample, channel] = (
-            trial.signal[sample, channel]
-            + self.bias[channel]
-            + trial.sign[sample, channel] * found.delta[real]
+            trial.signal[sample, channel] + trial.sign[sample, channel] * found.delta[real]
         )
         self.variance[sample, channel] = found.variance[real]
         self.slack[sample, channel] = found.slack[real]
@@ -167,24 +155,24 @@ def signal_prior(trial: Trial) -> SignalPrior:
     return learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0])
 
 
-def trial_biases(
+def calibrate_trial(
     trial: Trial,
     signal: Float[Arrays, "N 6"],
     extra: Float[Arrays, "N 6"],
-    sd: Float[Arrays, "6"],
-    start: Float[Arrays, "6"],
-) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
-    """Biases of the sensors (rad/s, m/s²) by one step from `start`, given a filled signal, and their covariance.
+    sd: Float[Arrays, "9"],
+    steps: Int[Arrays, ""] | int,
+    start: Calibration,
+) -> Calibration:
+    """The constants of a recording by some steps from `start`, given a filled signal; `extra` as above.
 
-    `extra` as above.
+    sd: prior sd of each.
     """
     samples = Samples(signal, trial.period, trial.variance + extra)
-    return estimate_biases(
-        samples, trial.rows, trial.prior, trial.prior_covariance, trial.gravity, sd, 1, start
-    )
+    known = trial.rows, trial.prior, trial.prior_covariance, trial.gravity
+    return calibrate(samples, *known, sd, steps, start)
 
 
-_bias = stored_jit(trial_biases)
+calibrate_recording = stored_jit(calibrate_trial)
 filter_recording = stored_jit(filter_trial)
 _solve = stored_jit(solve_segments)
 _prior = stored_jit(signal_prior, UNOPTIMISED)
@@ -211,13 +199,13 @@ def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 1
 
 
 def _solve_some(
-    trial, departures, table, segments: Segments, mine, prior, sizes: Sizes, options, fills: Fills
+    trial, calibrated, departures, table, segments: Segments, mine, prior, sizes: Sizes, options, fills: Fills
 ) -> None:
     """Solve the segments `mine`, padded to a bucket of lanes, and record them."""
     lanes = bucket(len(mine), 1)
     given = (departures, table[mine], segments.departure[mine], segments.arrival[mine])
     (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x, lanes), given)
-    found = _solve(trial, states, covariances, table, departure, arrival, prior, sizes, options)
+    found = _solve(calibrated, states, covariances, table, departure, arrival, prior, sizes, options)
     fills.record(trial, mine, *found)
 
 
@@ -225,35 +213,40 @@ def compensate_parallel(
     trial: Trial,
     segments: Segments,
     options: Options,
+    calibration: Calibration,
     sweeps: int = 2,
     progress: Progress | None = None,
-    filtered: Filtered | None = None,
-) -> Fills:
+) -> tuple[Fills, Calibration]:
     """Solve each segment on its own from one filter pass over the recording; then again with the filled signal.
 
-    filtered: the first of these passes, where it is at hand.
+    calibration: to begin with; the one that goes with the fills is returned with them.
     """
     fills = Fills.nothing(trial, len(segments))
-    table = arrival_table(trial, segments)
     prior = _prior(trial) if options.method == "map" else None
     chunks = list(_chunks(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
-    for sweep in range(sweeps):
-        if sweep or filtered is None:
-            filtered = filter_recording(trial, fills.unbiased, fills.variance)
+    for _ in range(sweeps):
+        here = trial.calibrated(calibration)
+        filled = fills.signal - np.asarray(calibration.constants)[None, :6]
+        filtered = filter_recording(here, filled, fills.variance)
         states, covariances, _ = jax.tree.map(np.asarray, filtered)
-        shifted = eqx.tree_at(lambda t: t.signal, trial, trial.signal - fills.bias[None])
+        table = arrival_table(here, segments)
         for mine, sizes in chunks:
             at = np.maximum(segments.departure[mine], 0)
             departures = jax.tree.map(lambda x, at=at: x[at], (states, covariances))
-            _solve_some(shifted, departures, table, segments, mine, prior, sizes, options, fills)
+            _solve_some(trial, here, departures, table, segments, mine, prior, sizes, options, fills)
             done += len(mine)
             if progress:
                 progress(done, sweeps * total)
-        if options.bias_sd is not None:
-            bias, known = _bias(trial, fills.signal, fills.variance, options.bias_sd, fills.bias)
-            fills = replace(fills, bias=np.asarray(bias), bias_sd=np.sqrt(np.diagonal(known)))
-    return fills
+        calibration = recalibrated(trial, fills, options, calibration)
+    return fills, calibration
+
+
+def recalibrated(trial: Trial, fills: Fills, options: Options, calibration: Calibration) -> Calibration:
+    """The calibration that goes with a filled signal, from the one before."""
+    if options.calibration_sd is None:
+        return calibration
+    return calibrate_recording(trial, fills.signal, fills.variance, options.calibration_sd, 1, calibration)
 
 
 def _chunks(
@@ -268,11 +261,19 @@ def _chunks(
 
 
 def compensate_sequential(
-    trial: Trial, segments: Segments, options: Options, progress: Progress | None = None
-) -> Fills:
-    """The paper's order: each segment departs from the filtered end of the one before, filled already."""
+    trial: Trial,
+    segments: Segments,
+    options: Options,
+    calibration: Calibration,
+    progress: Progress | None = None,
+) -> tuple[Fills, Calibration]:
+    """The paper's order: each segment departs from the filtered end of the one before, filled already.
+
+    calibration: as in `compensate_parallel`.
+    """
     fills = Fills.nothing(trial, len(segments))
-    table = arrival_table(trial, segments)
+    here, bias = trial.calibrated(calibration), np.asarray(calibration.constants)[None, :6]
+    table = arrival_table(here, segments)
     prior = _prior(trial) if options.method == "map" else None
     samples, values = count_values(trial.sign, segments)
     busy = np.flatnonzero(values)
@@ -281,22 +282,18 @@ def compensate_sequential(
     state, covariance, at = trial.prior, trial.prior_covariance, 0
     for count, index in enumerate(busy.tolist()):
         departure = max(0, int(segments.departure[index]))
-        state, covariance = _filter_to(trial, fills, state, covariance, at, departure)
+        span = (at, departure + 1, at == 0)
+        filtered = _filter_span(here, fills.signal - bias, fills.variance, state, covariance, *span)
+        last = departure - at
+        state, covariance = jax.tree.map(
+            lambda x, last=last: np.asarray(x[last]), (filtered.state, filtered.covariance)
+        )
         at = departure
-        here = jax.tree.map(lambda x: np.asarray(x)[None], (state, covariance))
-        _solve_some(trial, here, table, segments, np.array([index]), prior, sizes, options, fills)
+        departures = jax.tree.map(lambda x: x[None], (state, covariance))
+        _solve_some(trial, here, departures, table, segments, np.array([index]), prior, sizes, options, fills)
         if progress:
             progress(count + 1, len(busy))
-    return fills
-
-
-def _filter_to(trial: Trial, fills: Fills, state: NavState, covariance, start: int, stop: int):
-    """The filtered state at sample `stop`, from that at `start` (whose rows are used already, but at 0)."""
-    states, covariances, _ = _filter_span(
-        trial, fills.signal, fills.variance, state, covariance, start, stop + 1, start == 0
-    )
-    at = stop - start
-    return jax.tree.map(lambda x: np.asarray(x[at]), states), np.asarray(covariances[at])
+    return fills, recalibrated(trial, fills, options, calibration)
 
 
 def filter_part(

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.smoother import Rows
-from jaxsat.inertial.strapdown import NavState
+from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.gap_shapes import Edges, edge_slope
 from jaxsat.saturation.prior import SignalPrior, of_values
 from jaxsat.saturation.segment import Segment
@@ -40,6 +41,11 @@ class Trial(eqx.Module):
     def unfilled_variance(self) -> Float[Arrays, "N 6"]:
         """Of a saturated value while δ is 0: the second moment about that end of what its bounds leave."""
         return jnp.where(jnp.asarray(self.sign) != 0, jnp.asarray(self.bound**2 / 3.0)[None], 0.0)
+
+    def calibrated(self, calibration: Calibration) -> "Trial":
+        """Without the biases, and resting about the point that stands still."""
+        samples, rows = calibration.applied(Samples(self.signal, self.period, self.variance), self.rows)
+        return eqx.tree_at(lambda t: (t.signal, t.rows), self, (samples.signal, rows))
 
     def padded(self) -> "Trial":
         """With blank samples behind the end, to a length that recordings of about the same length share."""

@@ -102,8 +102,8 @@ class Options(eqx.Module):
     free_peak_time: bool = eqx.field(static=True)
     max_iterations: Int[Array, ""]
     tolerance: Float[Array, ""]
-    bias_sd: Float[Array, "6"] | None
-    """Of the sensors' biases; None where they are not estimated."""
+    calibration_sd: Float[Array, "9"] | None
+    """Prior sd of the constants of `Calibration`; None where none is estimated."""
 
 
 def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options) -> SegmentFill:

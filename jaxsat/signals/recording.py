@@ -44,3 +44,15 @@ class Recording(eqx.Module):
     def with_signal(self, signal: Float[np.ndarray, "N 6"]) -> "Recording":
         """The same recording with other values in its six channels."""
         return eqx.tree_at(lambda r: (r.gyr, r.acc), self, (signal[:, :3], signal[:, 3:]))
+
+
+def sensor_changes(signal: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 6"]:
+    """By how much each sensor's reading changes from a sample to one beside it, the larger of both; three axes alike.
+
+    A sample stands for all its period, and a sensor that is turned reads on one axis what was on another: what is
+    wrong with a value grows with this (rad/s, m/s²).
+    """
+    steps = np.linalg.norm(np.diff(signal, axis=0).reshape(-1, 2, 3), axis=2)
+    still = np.zeros((1, 2))
+    either = np.maximum(np.concatenate([still, steps]), np.concatenate([steps, still]))
+    return np.repeat(either, 3, axis=1)

@@ -20,6 +20,13 @@ LIVELIEST_REST = {"shoe": 1.0, "ared": 1.0, "amvd": 3.0, "mag": 3.0}
 # A walker takes a stride in 1.0 to 1.4 s, a runner in 0.7 s; a swing is ten times livelier than a stance.
 STRIDE, CONTRAST = 1.5, 10.0
 
+# A rest of at least this length (s) says what a gyroscope reads when nothing turns, and how sure that is by the means
+# of blocks of about `BLOCK`: who wears a sensor sways and settles within half a second.
+SHORTEST_OFFSET_REST, BLOCK = 1.0, 0.5
+# sd of the offset of a calibrated MEMS gyroscope (rad/s); one that is larger is believed where it exceeds what the
+# sway of the rests can be by `CLEAR` sd.
+OFFSET_SD, CLEAR = 3e-3, 2.0
+
 
 class Segments(eqx.Module):
     """Stretches of motion between rests, one row each; intervals are [start, end)."""
@@ -132,3 +139,30 @@ def find_segments(rest: Bool[np.ndarray, "N"]) -> Segments:
     follows = np.searchsorted(rest_start, end)
     ends = np.concatenate([rest_end, [len(rest)]])
     return Segments(departure=start - 1, arrival=end, rest_end=ends[follows])
+
+
+def resting_rate(
+    gyr: Float[np.ndarray, "N 3"], rest: Bool[np.ndarray, "N"], period: float
+) -> Float[np.ndarray, "3"]:
+    """Offset of a gyroscope from its mean rates at rests (rad/s), each axis by itself.
+
+    A foot that stands turns by a degree, which within a second passes for a large offset. So each rest counts by
+    the variance of its mean, from the means of its blocks, and the offset is shrunk by a prior: that of a calibrated
+    sensor, or what the rests show beyond their sway where that is larger (empirical Bayes). Zero where no rest is
+    long enough.
+    """
+    edge, weight, total = round(0.1 / period), np.zeros(3), np.zeros(3)
+    for start, end in zip(*runs(rest), strict=True):
+        if (end - start) * period < SHORTEST_OFFSET_REST:
+            continue
+        # The first and the last stir.
+        inside = gyr[start + (edge if start > 0 else 0) : end - edge]
+        count = max(3, int(len(inside) * period / BLOCK))
+        means = np.stack([block.mean(axis=0) for block in np.array_split(inside, count)])
+        precision = count / np.maximum(means.var(axis=0, ddof=1), 1e-8)
+        weight, total = weight + precision, total + precision * inside.mean(axis=0)
+    if not weight.any():
+        return total
+    mean, variance = total / weight, 1.0 / weight
+    prior = np.maximum(OFFSET_SD**2, mean**2 - CLEAR**2 * variance)
+    return mean * prior / (prior + variance)

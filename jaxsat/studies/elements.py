@@ -11,16 +11,19 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
+from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import compiled
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
+from jaxsat.pipeline import constants_sd
 from jaxsat.preparation import Prepared
+from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.compensate import (
-    arrival_table,
+    FIRST_STEPS,
+    calibrate_trial,
     filter_trial,
     signal_prior,
     solve_segments,
-    trial_biases,
 )
 from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
 from jaxsat.saturation.methods import Options
@@ -52,7 +55,7 @@ class Case(eqx.Module):
     """What was taken off the signal: rails act on what the sensor reads."""
     departure: Int[Arrays, "S"]
     arrival: Int[Arrays, "S"]
-    table: Float[Arrays, "S 10 10"]
+    rest_end: Int[Arrays, "S"]
     length: Int[Arrays, ""]
     path: Float[Arrays, "N 3"]
     """Of the recording as given, by the standard smoother."""
@@ -61,15 +64,16 @@ class Case(eqx.Module):
 def make_case(prepared: Prepared, busy: Int[np.ndarray, "B"], lanes: int, config: Config) -> Case:
     """A trial of which the segments `busy` may saturate."""
     trial, segments = prepared.trial, prepared.segments
-    # Without rows and samples beyond its arrival a padded lane has nothing to solve.
-    table = arrival_table(trial, segments)[busy]
-    path = _standard(trial, jnp.asarray(config.smoother.relinearisations))
+    path = _standard(trial, constants_sd(config), jnp.asarray(config.smoother.relinearisations))
+    # What a segment without a departure arrives at tells nothing about it. Nor does a padded lane have anything to
+    # solve.
+    rest_end = np.where(segments.departure >= 0, segments.rest_end, segments.arrival)
     return Case(
         trial=jax.tree.map(np.asarray, trial),
         offset=offset_of(prepared),
         departure=pad(segments.departure[busy], lanes),
         arrival=pad(segments.arrival[busy], lanes),
-        table=pad(table, lanes),
+        rest_end=pad(rest_end[busy], lanes),
         length=np.asarray(len(prepared.rest)),
         path=np.asarray(path),
     )
@@ -119,6 +123,7 @@ def run_elements(
         mesh,
         sizes,
         options,
+        constants_sd(config),
         config.saturation.sweeps,
         jnp.asarray(config.smoother.relinearisations),
         standard,
@@ -134,12 +139,13 @@ def _scores(
     mesh: Mesh,
     sizes: Sizes,
     options,
+    wanted,
     sweeps: int,
     relinearisations,
     standard: bool,
 ) -> Scores:
     def one(case, rail, bound):
-        return score(case, rail, bound, sizes, options, sweeps, relinearisations, standard)
+        return score(case, rail, bound, sizes, options, wanted, sweeps, relinearisations, standard)
 
     # Devices run on their own: a search that is done in one need not wait for another's.
     spread = PartitionSpec("elements")
@@ -154,11 +160,15 @@ def score(
     bound: Float[Array, "6"],
     sizes: Sizes,
     options: tuple[Options, ...],
+    wanted: Float[Array, "9"] | None,
     sweeps: int,
     relinearisations: Int[Array, ""],
     standard: bool,
 ) -> Scores:
-    """One trial clipped at one set of rails; every method on it."""
+    """One trial clipped at one set of rails; every method on it.
+
+    wanted: prior sd of what is constant, as `Options.calibration_sd`.
+    """
     whole, count = case.trial, len(case.path)
     raw = whole.signal + case.offset[None]
     real = jnp.arange(count) < case.length
@@ -190,35 +200,37 @@ def score(
 
     found = {}
     if standard:
-        path = _smooth_path(trial, signal, trial.variance, relinearisations)
+        known = _calibration(trial, signal, jnp.zeros_like(signal), wanted)
+        path = _smooth_path(trial, signal, trial.variance, known, relinearisations)
         found["standard"] = compared(path, signal)
     at, unfilled = jnp.maximum(case.departure, 0), trial.unfilled_variance
+    if options:
+        first = _calibration(trial, signal, unfilled, wanted)
+        bare = None if wanted is not None else _table(case, trial)
     for option in options:
         prior = signal_prior(trial) if option.method == "map" else None
 
         def once(before, _, option=option, prior=prior):
-            filled, extra, _, bias = before
-            filtered = filter_trial(trial, filled - bias[None], extra)
+            filled, extra, _, known = before
+            here = trial.calibrated(known)
+            filtered = filter_trial(here, filled - known.constants[None, :6], extra)
             states, covariances, _ = jax.tree.map(lambda x: x[at], filtered)
-            shifted = eqx.tree_at(lambda t: t.signal, trial, signal - bias[None])
+            table = _table(case, here) if bare is None else bare
             fill, values = solve_segments(
-                shifted, states, covariances, case.table, case.departure, case.arrival, prior, sizes, option
+                here, states, covariances, table, case.departure, case.arrival, prior, sizes, option
             )
             place = (values.sample, values.channel)
             way = sign.at[place].get(mode="fill", fill_value=0)
             filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")
             extra, slack = (unfilled.at[place].set(x, mode="drop") for x in (fill.variance, fill.slack))
-            if option.bias_sd is not None:
-                # A recording that does not saturate is left as it is.
-                moved, _ = trial_biases(trial, filled, extra, option.bias_sd, bias)
-                bias = jnp.where(jnp.any(sign != 0), moved, 0.0)
-            return (filled, extra, slack, bias), (fill, values)
+            known = _calibration(trial, filled, extra, wanted, 1, known)
+            return (filled, extra, slack, known), (fill, values)
 
         # A loop, not a repetition: the program is compiled once.
-        begin = (signal, unfilled, unfilled, jnp.zeros(6, signal.dtype))
-        (filled, _, slack, bias), every = jax.lax.scan(once, begin, None, length=sweeps)
+        begin = (signal, unfilled, unfilled, first)
+        (filled, _, slack, known), every = jax.lax.scan(once, begin, None, length=sweeps)
         fill, values = jax.tree.map(lambda x: x[-1], every)
-        path = _smooth_path(trial, filled - bias[None], trial.variance + slack, relinearisations)
+        path = _smooth_path(trial, filled, trial.variance + slack, known, relinearisations)
         busy = jnp.any(values.sample < count, axis=1)
         order = jnp.asarray([_SEVERITY.index(status) for status in sorted(Status)])
         worst = jnp.max(jnp.where(busy, order[fill.solution.status], 0))
@@ -235,11 +247,25 @@ def score(
     return found
 
 
-def _smooth_path(trial: Trial, signal, variance, relinearisations) -> Float[Array, "N 3"]:
-    samples = Samples(signal, jnp.asarray(trial.period), variance)
+def _calibration(
+    trial: Trial, signal, extra, wanted, steps: int = FIRST_STEPS, start: Calibration | None = None
+) -> Calibration:
+    start = Calibration.none() if start is None else start
+    return start if wanted is None else calibrate_trial(trial, signal, extra, wanted, steps, start)
+
+
+def _table(case: Case, trial: Trial) -> Float[Array, "S 10 10"]:
+    """Λ of each arrival."""
+    samples = Samples(trial.signal, trial.period, trial.variance)
+    longest = jnp.max(case.rest_end - case.arrival)
+    return arrivals(samples, trial.rows, case.arrival, case.rest_end, longest)
+
+
+def _smooth_path(trial: Trial, signal, variance, known: Calibration, relinearisations) -> Float[Array, "N 3"]:
+    samples, rows = known.applied(Samples(signal, jnp.asarray(trial.period), variance), trial.rows)
     smoothed = smooth(
         samples,
-        trial.rows,
+        rows,
         trial.prior,
         jnp.asarray(trial.prior_covariance),
         jnp.asarray(trial.gravity),
@@ -249,5 +275,7 @@ def _smooth_path(trial: Trial, signal, variance, relinearisations) -> Float[Arra
 
 
 @compiled
-def _standard(trial: Trial, relinearisations) -> Float[Array, "N 3"]:
-    return _smooth_path(jax.tree.map(jnp.asarray, trial), trial.signal, trial.variance, relinearisations)
+def _standard(trial: Trial, wanted, relinearisations) -> Float[Array, "N 3"]:
+    trial = jax.tree.map(jnp.asarray, trial)
+    known = _calibration(trial, trial.signal, jnp.zeros_like(trial.signal), wanted)
+    return _smooth_path(trial, trial.signal, trial.variance, known, relinearisations)

@@ -103,7 +103,9 @@ class NoiseTrial(eqx.Module):
 
     trial: Trial
     measured: Bool[np.ndarray, "N 6"]
-    """The variance of the value is that of the sensor's density."""
+    """The variance of the value is that of the sensor's density and of its changes."""
+    extra: Float[np.ndarray, "N 6"]
+    """Its variance beyond that (`noise.change`)."""
     axes: Float[np.ndarray, "6"]
     """Density of each channel over that of its sensor."""
     at_rest: Bool[np.ndarray, ""]
@@ -119,9 +121,10 @@ class NoiseTrial(eqx.Module):
         trial = jax.tree.map(jnp.asarray, self.trial)
         density = jnp.repeat(noise[:2], 3) * self.axes
         held = jnp.where(trial.period > 0.0, trial.period, 1.0)
-        variance = jnp.where(self.measured, density[None] ** 2 / held[:, None], trial.variance)
+        white = density[None] ** 2 / held[:, None]
+        variance = jnp.where(self.measured, white + self.extra, trial.variance)
         still = jnp.full_like(trial.period, noise[2] ** 2)
-        rows = Rows(trial.rows.rest, still, trial.rows.height, trial.rows.height_variance)
+        rows = eqx.tree_at(lambda r: r.velocity_variance, trial.rows, still)
         diagonal = jnp.diag(trial.prior_covariance)
         start = jnp.where(self.at_rest & (jnp.arange(9) >= 6), noise[2] ** 2, diagonal)
         covariance = trial.prior_covariance + jnp.diag(start - diagonal)
@@ -142,8 +145,7 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
     with jax.enable_x64(True):
         prepared = prepare(recording, config)
     n, size = len(recording), len(prepared.trial.signal)
-    density = np.array(config.noise.densities)
-    plain = np.isclose(prepared.trial.variance[:n], density**2 / recording.period, rtol=1e-9, atol=0.0)
+    extra = prepared.trial.variance[:n] - np.array(config.noise.densities) ** 2 / recording.period
     position, scored = np.zeros((n, 3)), np.zeros(n, bool)
     if truth is not None:
         time, track = truth
@@ -156,7 +158,8 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
             )
     return NoiseTrial(
         prepared.trial,
-        pad(plain, size),
+        pad(~recording.missing, size),
+        pad(extra, size),
         np.array(config.noise.axes),
         np.asarray(prepared.rest[0]),
         np.asarray(config.smoother.relinearisations),

@@ -1,0 +1,128 @@
+"""Constants of a recording, estimated in the smoother's own problem: biases of the sensors, and a lever.
+
+A foot is never still: while it stands it rolls, and the sensor on it moves about the point that does stand still. Of
+that point, a lever ℓ away from the sensor in the body frame, the velocity v + R_nb (ω × ℓ) is zero: the zero-velocity
+rows of Eq. 13, with ℓ to be found.
+
+The quadratic problem of Eq. 14 with these constants c = [b, ℓ] among its variables is still one forward pass: the
+mean of the filter becomes a matrix over [1, c], each innovation a row of it, and the sum of their squares over their
+variances is the cost as a quadratic in c. Its minimum is what the smoother with nine more states would find.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsat.inertial import kalman
+from jaxsat.inertial.dense import inverse_positive
+from jaxsat.inertial.rotations import quat_exp, quat_multiply, quat_to_matrix, skew
+from jaxsat.inertial.smoother import VELOCITY, Rows, linearised, smooth
+from jaxsat.inertial.strapdown import (
+    NavState,
+    Samples,
+    error_transition,
+    sample_noise,
+)
+
+CONSTANTS = 9
+"""Biases of gyroscope and accelerometer (rad/s, m/s²), and the lever (m)."""
+
+
+class Calibration(eqx.Module):
+    """What is constant in a recording, and how well it is known."""
+
+    constants: Float[Array, "9"]
+    """[b, ℓ] (rad/s, m/s², m)."""
+    sd: Float[Array, "9"]
+    """Of each; zero where it is not estimated."""
+
+    @staticmethod
+    def none() -> "Calibration":
+        return Calibration(jnp.zeros(CONSTANTS), jnp.zeros(CONSTANTS))
+
+    def applied(self, samples: Samples, rows: Rows) -> tuple[Samples, Rows]:
+        """Samples without the biases, and rests about the point that stands still."""
+        signal = samples.signal - self.constants[None, :6]
+        velocity = jnp.cross(self.constants[None, 6:], signal[:, :3])
+        known = Rows(rows.rest, rows.velocity_variance, rows.height, rows.height_variance, velocity)
+        return Samples(signal, samples.period, samples.variance), known
+
+
+def constants_quadratic(
+    reference: NavState,
+    samples: Samples,
+    rows: Rows,
+    prior_covariance: Float[Array, "9 9"],
+    gravity: Float[Array, ""],
+) -> Float[Array, "10 10"]:
+    """Λ with J(c) = ½ [1; c]ᵀ Λ [1; c], c being what is left of the constants in samples and rows.
+
+    reference: N+1 states to linearise about; height rows are not used.
+    """
+    start, intervals, offsets = linearised(reference, samples, gravity)
+
+    def step(carry, inputs):
+        mean, covariance, total = carry
+        state, interval, sample, offset, row = inputs
+        # A lever that is left moves the sensor at rest by ℓ × ω.
+        moves = quat_to_matrix(state.q_nb) @ skew(sample.signal[:3])
+        for axis, (index, misfit) in enumerate(zip(VELOCITY, row.misfit(state), strict=True)):
+            column = covariance[:, index]
+            weight = jnp.where(row.rest, 1.0 / (column[index] + row.velocity_variance), 0.0)
+            innovation = (-mean[index]).at[0].add(misfit).at[7:].add(-moves[axis])
+            total = total + weight * jnp.outer(innovation, innovation)
+            mean = mean + weight * jnp.outer(column, innovation)
+            covariance = covariance - weight * jnp.outer(column, column)
+        transition = error_transition(state.q_nb, interval)
+        # A bias that is there turns and pushes the reference too much.
+        middle = quat_multiply(state.q_nb, quat_exp(0.5 * sample.period * sample.signal[:3]))
+        turned, zero = -quat_to_matrix(middle) * sample.period, jnp.zeros((3, 3))
+        rate = jnp.concatenate([turned, zero, zero])
+        force = jnp.concatenate([zero, 0.5 * sample.period * turned, turned])
+        shift, covariance = kalman.predict(
+            mean[:, 0],
+            covariance,
+            transition.forth,
+            offset,
+            sample_noise(state.q_nb, sample.signal, sample.period, sample.variance),
+        )
+        moved = transition.forth(mean[:, 1:]) + jnp.concatenate([rate, force, jnp.zeros((9, 3))], axis=1)
+        return (jnp.concatenate([shift[:, None], moved], axis=1), covariance, total), None
+
+    size = 1 + CONSTANTS
+    carry = (jnp.zeros((9, size)), prior_covariance, jnp.zeros((size, size)))
+    (_, _, total), _ = jax.lax.scan(step, carry, (start, intervals, samples, offsets, rows))
+    return total
+
+
+def calibrate(
+    samples: Samples,
+    rows: Rows,
+    prior: NavState,
+    prior_covariance: Float[Array, "9 9"],
+    gravity: Float[Array, ""],
+    sd: Float[Array, "9"],
+    steps: Int[Array, ""] | int,
+    start: Calibration,
+) -> Calibration:
+    """The constants with a zero-mean prior, by Gauss-Newton steps from `start`.
+
+    sd: prior standard deviation of each (rad/s, m/s², m); zero where it is not wanted.
+    """
+    # One that is not wanted is as good as known.
+    scale = jnp.maximum(sd, 1e-12)
+
+    def step(_, now: Calibration) -> Calibration:
+        left, known = now.applied(samples, rows)
+        reference = smooth(left, known, prior, prior_covariance, gravity, 0).state
+        quadratic = constants_quadratic(reference, left, known, prior_covariance, gravity)
+        # In units of the prior, where the Hessian is at least the identity.
+        hessian = jnp.eye(CONSTANTS) + quadratic[1:, 1:] * scale[:, None] * scale[None]
+        gradient = now.constants / scale + quadratic[1:, 0] * scale
+        covariance = inverse_positive(hessian)
+        constants = now.constants - scale * (covariance @ gradient)
+        found = scale * jnp.sqrt(jnp.diagonal(covariance))
+        return Calibration(jnp.where(sd > 0.0, constants, 0.0), jnp.where(sd > 0.0, found, 0.0))
+
+    return jax.lax.fori_loop(0, steps, step, start)
