@@ -30,8 +30,8 @@ class Noise(_Section):
     noisier. Their common size is such that J* is about half of its number of rows.
     """
 
-    gyr_density: float = Field(default=2e-3, gt=0, description="angular-rate noise density (rad/s/√Hz)")
-    acc_density: float = Field(default=4e-3, gt=0, description="specific-force noise density (m/s²/√Hz)")
+    gyr_density: float = Field(default=1e-3, gt=0, description="angular-rate noise density (rad/s/√Hz)")
+    acc_density: float = Field(default=1e-3, gt=0, description="specific-force noise density (m/s²/√Hz)")
     axes: tuple[_Factor, ...] = Field(
         default=(1.0,) * 6,
         min_length=6,

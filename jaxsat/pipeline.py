@@ -123,12 +123,12 @@ def constants_sd(config: Config) -> Float[Array, "9"] | None:
     return jnp.asarray(sd) if any(sd) else None
 
 
-def _calibrated(trial: Trial, extra: Float[np.ndarray, "N 6"], config: Config) -> Calibration:
-    """The constants that the rests of a recording tell, `extra` being the variance of what saturates."""
+def _calibrated(trial: Trial, config: Config) -> Calibration:
+    """The constants that the rests of a recording tell; what saturates may be anything within its bounds."""
     sd, none = constants_sd(config), Calibration.none()
     if sd is None:
         return none
-    return calibrate_recording(trial, trial.signal, extra, sd, FIRST_STEPS, none)
+    return calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, FIRST_STEPS, none)
 
 
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
@@ -138,8 +138,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))
     searched = without_floor(trial, config)
-    unfilled = np.asarray(trial.unfilled_variance)
-    calibration = _calibrated(searched, np.zeros_like(unfilled), config)
+    calibration = _calibrated(searched, config)
     sure = trial.calibrated(calibration)
     standard, floor = _smooth(sure, config)
     smoothed = standard
@@ -147,8 +146,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     if config.method != "standard" and len(gaps):
         options = search_options(config, config.method)
         report = partial(progress, "segments")
-        # Saturated values tell nothing of the sensors before they are filled.
-        given = searched, segments, options, _calibrated(searched, unfilled, config)
+        given = searched, segments, options, calibration
         if config.saturation.segments == "parallel":
             fills, calibration = compensate_parallel(*given, config.saturation.sweeps, report)
         else:

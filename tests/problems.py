@@ -25,10 +25,11 @@ def samples(count: int = 60, seed: int = 0, isotropic: bool = False) -> Samples:
 
 
 def rows(rest: np.ndarray, height: np.ndarray | None = None) -> Rows:
-    """Zero velocity to 1 cm/s, height to 2 cm."""
+    """A velocity of some cm/s in the body frame to 1 cm/s, height to 2 cm."""
     height = np.zeros_like(rest) if height is None else height
     everywhere = jnp.ones(len(rest))
-    return Rows(jnp.asarray(rest), 1e-4 * everywhere, jnp.asarray(height), 4e-4 * everywhere)
+    velocity = jnp.asarray(0.03 * np.random.default_rng(7).normal(size=(len(rest), 3)))
+    return Rows(jnp.asarray(rest), 1e-4 * everywhere, jnp.asarray(height), 4e-4 * everywhere, velocity)
 
 
 def departure(seed: int = 0) -> tuple[NavState, jnp.ndarray]:

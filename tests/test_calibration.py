@@ -1,4 +1,4 @@
-"""Biases in the smoother's problem: the quadratic against the smoother's own cost, and what they are in truth."""
+"""Biases and the lever in the smoother's problem: the quadratic against the smoother's own cost, and the truth."""
 
 import equinox as eqx
 import jax
@@ -8,8 +8,9 @@ import problems
 import pytest
 
 from jaxsat.config import load_config
-from jaxsat.inertial.biases import bias_quadratic, estimate_biases
-from jaxsat.inertial.smoother import Rows, closed_loop, smooth_about
+from jaxsat.inertial.calibration import Calibration, calibrate, constants_quadratic
+from jaxsat.inertial.rotations import quat_to_matrix
+from jaxsat.inertial.smoother import Rows, closed_loop, smooth, smooth_about
 from jaxsat.inertial.strapdown import (
     NavState,
     Samples,
@@ -27,14 +28,14 @@ N = 60
 REST = np.zeros(N, bool)
 REST[:8] = REST[25:33] = REST[50:] = True
 GYR_BIAS, ACC_BIAS = np.array([2e-3, -1e-3, 1.5e-3]), np.array([0.05, -0.03, 0.02])
-ESTIMATE = jax.jit(estimate_biases, static_argnames="steps")
+CALIBRATE = jax.jit(calibrate)
 
 
 @pytest.fixture(scope="module")
 def problem():
     """A lively motion, and the corrected states of its filter to linearise about; heights are not observed."""
     rest = problems.rows(REST)
-    rows = Rows(rest.rest, rest.velocity_variance, None, rest.height_variance)
+    rows = Rows(rest.rest, rest.velocity_variance, None, rest.height_variance, rest.velocity)
     prior, covariance = problems.departure()
     samples = problems.samples(N)
     reference = closed_loop(samples, rows, prior, covariance, problems.GRAVITY).state
@@ -43,9 +44,9 @@ def problem():
     return reference, samples, rows, prior, covariance
 
 
-def test_without_biases_the_quadratic_is_the_cost_of_the_smoother(problem):
+def test_without_constants_the_quadratic_is_the_cost_of_the_smoother(problem):
     reference, samples, rows, _, covariance = problem
-    found = jax.jit(bias_quadratic)(reference, samples, rows, covariance, problems.GRAVITY)
+    found = jax.jit(constants_quadratic)(reference, samples, rows, covariance, problems.GRAVITY)
     cost = jax.jit(smooth_about)(reference, samples, rows, *problem[3:], problems.GRAVITY).cost
     assert 0.5 * found[0, 0] == pytest.approx(float(cost), rel=1e-9)
     np.testing.assert_allclose(found, found.T, rtol=1e-12)
@@ -67,9 +68,11 @@ def dense_cost(reference, samples: Samples, rows: Rows, covariance):
     rest = np.flatnonzero(rows.rest)
     H = np.concatenate([9 * k + np.arange(6, 9) for k in rest])
     S = C[np.ix_(H, H)] + float(rows.velocity_variance[0]) * np.eye(len(H))
-    measured = -np.asarray(reference.velocity)[rest].ravel()
+    R, turning = jax.vmap(quat_to_matrix)(at), samples.signal[:, :3]
 
-    def cost(offsets) -> float:
+    def cost(offsets, lever) -> float:
+        moves = np.einsum("kij,kj->ki", R, rows.velocity + np.cross(lever, turning))
+        measured = (moves - np.asarray(reference.velocity)[:-1])[rest].ravel()
         mean = np.zeros((N + 1, 9))
         for k in range(N):
             mean[k + 1] = transitions[k] @ mean[k] + offsets[k]
@@ -82,7 +85,7 @@ def dense_cost(reference, samples: Samples, rows: Rows, covariance):
 def test_gradient_and_hessian_equal_differences_of_a_dense_cost(problem):
     """The effect of a bias on each step is taken from the strapdown itself, by central differences."""
     reference, samples, rows, _, covariance = problem
-    found = np.asarray(jax.jit(bias_quadratic)(reference, samples, rows, covariance, problems.GRAVITY))
+    found = np.asarray(jax.jit(constants_quadratic)(reference, samples, rows, covariance, problems.GRAVITY))
     start, end = (jax.tree.map(lambda x, s=s: x[s], reference) for s in (slice(None, -1), slice(1, None)))
 
     @jax.jit
@@ -96,10 +99,10 @@ def test_gradient_and_hessian_equal_differences_of_a_dense_cost(problem):
     effect = np.stack([(offsets(h * e) - offsets(-h * e)) / (2 * h) for e in np.eye(6)], axis=-1)
     of_offsets, unbiased = dense_cost(reference, samples, rows, covariance), np.asarray(offsets(zero))
 
-    def cost(bias):
-        return of_offsets(unbiased + effect @ bias)
+    def cost(constants):
+        return of_offsets(unbiased + effect @ constants[:6], constants[6:])
 
-    unit = np.repeat([1e-2, 1e-1], 3)
+    unit = np.repeat([1e-2, 1e-1, 1e-2], 3)
     E = np.diag(unit)
     gradient = np.array([(cost(e) - cost(-e)) / 2 for e in E])
     hessian = np.array([[(cost(a + b) - cost(a - b) - cost(b - a) + cost(-a - b)) / 4 for b in E] for a in E])
@@ -119,6 +122,7 @@ def biased_walk():
     noise = {"gyr_density": sensor.gyr_density, "acc_density": sensor.acc_density, "rest_velocity_sd": 0.01}
     settings = {f"noise.{name}": value for name, value in noise.items()}
     settings |= {"smoother.gyr_offset": "none", "gravity": 9.80665, "rails.gyr": "none", "rails.acc": "none"}
+    settings |= {"noise.change": 0.0}
     return jax.tree.map(jnp.asarray, prepare(recording, load_config(None, **settings)).trial)
 
 
@@ -126,20 +130,75 @@ def found_on(trial, sd, steps=3):
     samples = Samples(trial.signal, trial.period, trial.variance)
     prior = NavState(*jax.tree.leaves(trial.prior))
     given = (samples, trial.rows, prior, trial.prior_covariance, trial.gravity, jnp.asarray(sd))
-    return ESTIMATE(*given, steps=steps, start=jnp.zeros(6))
+    return CALIBRATE(*given, jnp.asarray(steps), Calibration.none())
 
 
 def test_biases_of_a_simulated_walk_are_found_within_their_own_sd(biased_walk):
-    prior_sd = np.repeat([5e-3, 0.1], 3)
-    bias, covariance = found_on(biased_walk, prior_sd)
-    sd, truth = np.sqrt(np.diag(covariance)), np.concatenate([GYR_BIAS, ACC_BIAS])
-    assert (np.abs(bias - truth) < 4.0 * sd).all()
+    prior_sd = np.repeat([5e-3, 0.1, 0.0], 3)
+    found = found_on(biased_walk, prior_sd)
+    truth = np.concatenate([GYR_BIAS, ACC_BIAS])
+    sd = np.asarray(found.sd)[:6]
+    assert (np.abs(found.constants[:6] - truth) < 4.0 * sd).all()
     # They are learned, not only allowed: horizontal rates and the vertical force far better than the prior knew.
-    assert (sd <= prior_sd * (1 + 1e-9)).all() and (sd < 0.2 * prior_sd).sum() >= 3
-    np.testing.assert_allclose(bias[5], truth[5], atol=0.01)
+    assert (sd <= prior_sd[:6] * (1 + 1e-9)).all() and (sd < 0.2 * prior_sd[:6]).sum() >= 3
+    np.testing.assert_allclose(found.constants[5], truth[5], atol=0.01)
+    # What is not wanted stays away, to the last bit.
+    assert not found.constants[6:].any() and not found.sd[6:].any()
 
 
-def test_biases_that_cannot_be_are_zero(biased_walk):
-    bias, covariance = found_on(biased_walk, np.full(6, 1e-9))
-    assert np.abs(bias).max() < 1e-9
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), 1e-9, rtol=1e-3)
+def rolling(lever: np.ndarray, angle: float = 0.5):
+    """A sensor on a foot: it rests about a point of the ground, and rolls there by `angle` in a second.
+
+    Between two rests it moves to and fro without turning. Signals follow from position and attitude as functions of
+    time: with the point at p(t), the sensor is at r = p − R ℓ, and f = Rᵀ(r̈ + g).
+    """
+    T, n = 0.01, 700
+    t = np.arange(n) * T
+    # Rests of a second with a roll, one second of motion between them.
+    rest = (np.floor(t) % 2) == 0
+
+    def roll(t):
+        phase = t % 2.0
+        smooth = jnp.where(phase < 1.0, phase - jnp.sin(2 * jnp.pi * phase) / (2 * jnp.pi), 1.0)
+        back = jnp.where(phase > 1.0, (phase - 1) - jnp.sin(2 * jnp.pi * (phase - 1)) / (2 * jnp.pi), 0.0)
+        return angle * (smooth - back)
+
+    def point(t):
+        phase = jnp.maximum(t % 2.0 - 1.0, 0.0)
+        moved = phase - jnp.sin(2 * jnp.pi * phase) / (2 * jnp.pi)
+        return jnp.array([1.0, 0.2, 0.0]) * (jnp.floor(t / 2.0) + moved)
+
+    def R(t):
+        c, s = jnp.cos(roll(t)), jnp.sin(roll(t))
+        return jnp.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+    def place(t):
+        return point(t) - R(t) @ jnp.asarray(lever)
+
+    middle = jnp.asarray(t + 0.5 * T)
+    force = jax.vmap(lambda t: R(t).T @ (jax.jacfwd(jax.jacfwd(place))(t) + jnp.array([0, 0, 9.81])))(middle)
+    rate = jnp.zeros((n, 3)).at[:, 1].set(jax.vmap(jax.grad(roll))(middle))
+    return rest, jnp.concatenate([rate, force], axis=1), np.asarray(jax.vmap(place)(jnp.asarray(t)))
+
+
+def test_the_lever_of_a_foot_that_rolls_is_found_and_its_path_mended():
+    lever = np.array([0.08, 0.0, -0.05])
+    rest, signal, path = rolling(lever)
+    n = len(rest)
+    variance = jnp.broadcast_to(jnp.repeat(jnp.array([1e-6, 1e-4]), 3), (n, 6))
+    samples = Samples(signal, jnp.full(n, 0.01), variance)
+    rows = Rows(jnp.asarray(rest), jnp.full(n, 1e-4), None, jnp.ones(n), jnp.zeros((n, 3)))
+    prior = NavState(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), jnp.zeros(3))
+    known = (prior, jnp.diag(jnp.array([1e-5, 1e-5, 0, 0, 0, 0, 1e-4, 1e-4, 1e-4])), jnp.asarray(9.81))
+    sd = jnp.repeat(jnp.array([0.0, 0.0, 0.1]), 3)
+    found = CALIBRATE(samples, rows, *known, sd, jnp.asarray(2), Calibration.none())
+    np.testing.assert_allclose(found.constants[6:9:2], lever[::2], atol=5e-3)
+    # Nothing turns about y's own axis: only the prior speaks of the lever along it.
+    assert abs(found.constants[7]) < 1e-3 and found.sd[7] == pytest.approx(0.1, rel=0.01)
+    run = jax.jit(smooth)
+    errors = []
+    for calibration in (Calibration.none(), found):
+        smoothed = run(*calibration.applied(samples, rows), *known)
+        moved = np.asarray(smoothed.state.position)[:-1] - np.asarray(smoothed.state.position)[0]
+        errors.append(np.sqrt(np.mean(np.sum((moved - (path - path[0])) ** 2, axis=1))))
+    assert errors[1] < 0.2 * errors[0]

@@ -7,6 +7,7 @@ import numpy as np
 import problems
 import pytest
 
+from jaxsat.inertial.rotations import quat_to_matrix
 from jaxsat.inertial.smoother import (
     HEIGHT,
     VELOCITY,
@@ -64,10 +65,13 @@ def dense(reference, samples, rows, prior, prior_covariance, whole=False):
         root[k + 1][:, 9 * (k + 1) : 9 * (k + 2)] = vectors * np.sqrt(np.maximum(values, 0.0))
     H, z, r = [], [], []
     for k in range(N):
+        moves = np.zeros(3)
+        if rows.velocity is not None:
+            moves = np.asarray(quat_to_matrix(reference.q_nb[k]) @ rows.velocity[k])
         for axis, index in enumerate(VELOCITY):
             if rows.rest[k]:
                 H.append(9 * k + index)
-                z.append(-reference.velocity[k, axis])
+                z.append(moves[axis] - reference.velocity[k, axis])
                 r.append(rows.velocity_variance[k])
         if rows.height[k]:
             H.append(9 * k + HEIGHT)
@@ -91,7 +95,7 @@ def dense(reference, samples, rows, prior, prior_covariance, whole=False):
 def test_without_heights_only_the_position_of_the_filter_changes():
     """What no row sees is left out of the filter; the smoother still knows all of it."""
     rows = problems.rows(REST)
-    unused = Rows(rows.rest, rows.velocity_variance, None, rows.height_variance)
+    unused = Rows(rows.rest, rows.velocity_variance, None, rows.height_variance, rows.velocity)
     prior, covariance = problems.departure()
     full, small = (closed_loop(SAMPLES, r, prior, covariance, problems.GRAVITY) for r in (rows, unused))
     motion = np.array([0, 1, 2, 6, 7, 8])
@@ -148,7 +152,7 @@ def almost_still(seed: int = 2):
 def test_last_state_of_the_closed_loop_is_the_kalman_filter():
     """Filter and smoother agree at the end, where no row follows, but for linearisation."""
     samples, prior, covariance = almost_still()
-    rows = problems.rows(REST)
+    rows = eqx.tree_at(lambda r: r.velocity, problems.rows(REST), jnp.zeros((N, 3)))
     states, filtered, _ = closed_loop(samples, rows, prior, covariance, problems.GRAVITY)
     found = SMOOTH(samples, rows, prior, covariance, problems.GRAVITY, jnp.asarray(0))
     scale = np.sqrt(np.diag(filtered[-1]).clip(1e-12))

@@ -198,15 +198,12 @@ def score(
             **{f"fill_rmse_{sensor}": fill[i] for i, sensor in enumerate(("gyr", "acc"))},
         }
 
-    found = {}
+    found, at, unfilled = {}, jnp.maximum(case.departure, 0), trial.unfilled_variance
+    first = _calibration(trial, signal, unfilled, wanted)
     if standard:
-        known = _calibration(trial, signal, jnp.zeros_like(signal), wanted)
-        path = _smooth_path(trial, signal, trial.variance, known, relinearisations)
+        path = _smooth_path(trial, signal, trial.variance, first, relinearisations)
         found["standard"] = compared(path, signal)
-    at, unfilled = jnp.maximum(case.departure, 0), trial.unfilled_variance
-    if options:
-        first = _calibration(trial, signal, unfilled, wanted)
-        bare = None if wanted is not None else _table(case, trial)
+    bare = None if wanted is not None or not options else _table(case, trial)
     for option in options:
         prior = signal_prior(trial) if option.method == "map" else None
 
@@ -277,5 +274,5 @@ def _smooth_path(trial: Trial, signal, variance, known: Calibration, relinearisa
 @compiled
 def _standard(trial: Trial, wanted, relinearisations) -> Float[Array, "N 3"]:
     trial = jax.tree.map(jnp.asarray, trial)
-    known = _calibration(trial, trial.signal, jnp.zeros_like(trial.signal), wanted)
+    known = _calibration(trial, trial.signal, trial.unfilled_variance, wanted)
     return _smooth_path(trial, trial.signal, trial.variance, known, relinearisations)
