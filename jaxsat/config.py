@@ -56,6 +56,11 @@ class Noise(_Section):
         sensors = [self.gyr_density] * 3 + [self.acc_density] * 3
         return [density * factor for density, factor in zip(sensors, self.axes, strict=True)]
 
+    @property
+    def changes(self) -> list[float]:
+        """`change` of the six channels."""
+        return [self.change * factor for factor in self.axes]
+
 
 class Rests(_Section):
     """When the sensor stands still."""

@@ -123,7 +123,7 @@ def constants_sd(config: Config) -> Float[Array, "9"] | None:
     return jnp.asarray(sd) if any(sd) else None
 
 
-def _calibrated(trial: Trial, config: Config) -> Calibration:
+def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
     """The constants that the rests of a recording tell; what saturates may be anything within its bounds."""
     sd, none = constants_sd(config), Calibration.none()
     if sd is None:
@@ -138,7 +138,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))
     searched = without_floor(trial, config)
-    calibration = _calibrated(searched, config)
+    calibration = calibrate_by_rests(searched, config)
     sure = trial.calibrated(calibration)
     standard, floor = _smooth(sure, config)
     smoothed = standard

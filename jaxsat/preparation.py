@@ -120,7 +120,7 @@ def _trial(
     # Density to per-sample variance; a value that was not measured may be anything the channel did.
     noise, limits = config.noise, config.saturation
     density = np.array(noise.densities)
-    plain = density**2 / T + (noise.change * sensor_changes(signal)) ** 2
+    plain = density**2 / T + (np.array(noise.changes) * sensor_changes(signal)) ** 2
     variance = np.where(recording.missing, np.maximum(signal.var(axis=0), plain), plain)
 
     # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI

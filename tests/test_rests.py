@@ -8,8 +8,16 @@ import scipy.io
 from scipy.ndimage import uniform_filter1d
 
 from jaxsat.signals.readers import read
-from jaxsat.signals.recording import Recording
-from jaxsat.signals.rests import detector_statistic, find_rests, find_segments, rest_threshold, runs
+from jaxsat.signals.recording import Recording, sensor_changes
+from jaxsat.signals.rests import (
+    OFFSET_SD,
+    detector_statistic,
+    find_rests,
+    find_segments,
+    rest_threshold,
+    resting_rate,
+    runs,
+)
 
 PERIOD = 0.005
 DETECTORS = ("shoe", "ared", "amvd", "mag")
@@ -177,3 +185,49 @@ def test_board_rests_where_the_experimenters_say(shared_data):
         moving = np.load(path)["movement"]
         assert np.mean(rest == ~moving) > 0.98, path.name
         assert np.mean(rest[moving]) < 0.05, path.name
+
+
+OFFSET = np.array([0.02, -0.01, 0.0])
+
+
+def swaying(n: int, sway: float, seed: int = 0) -> np.ndarray:
+    """Rates of a sensor that turns to and fro with a correlation of half a second, and has an offset."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal((n, 3))
+    correlated = uniform_filter1d(white, round(0.5 / PERIOD), axis=0) * np.sqrt(0.5 / PERIOD)
+    return OFFSET + 1e-3 * rng.standard_normal((n, 3)) + sway * correlated
+
+
+def test_a_gyroscope_that_lies_still_says_its_offset():
+    found = resting_rate(swaying(600, sway=0.0), np.ones(600, bool), PERIOD)
+    np.testing.assert_allclose(found, OFFSET, atol=2e-4)
+
+
+def test_a_rest_that_sways_is_believed_as_far_as_it_goes():
+    """Over many seeds the offset from two seconds of sway is nearer to the truth than the mean rate."""
+    rest, errors = np.ones(400, bool), []
+    for seed in range(40):
+        rates = swaying(400, sway=0.02, seed=seed) - OFFSET
+        errors.append([resting_rate(rates, rest, PERIOD), rates.mean(axis=0)])
+    shrunk, mean = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
+    assert shrunk < 0.7 * mean
+    # Where there is a large one, it is not mistaken for sway.
+    large = [resting_rate(swaying(400, sway=0.002, seed=seed), rest, PERIOD) for seed in range(40)]
+    assert np.abs(np.mean(large, axis=0) - OFFSET).max() < OFFSET_SD
+
+
+def test_a_quiet_rest_outweighs_a_stirring_one_and_short_ones_are_not_asked():
+    stirring, quiet = swaying(300, sway=0.05), swaying(400, sway=0.0)
+    moving = np.full((100, 3), 3.0)
+    rates = np.concatenate([stirring, moving, quiet])
+    rest = np.abs(rates).max(axis=1) < 2.0
+    np.testing.assert_allclose(resting_rate(rates, rest, PERIOD), OFFSET, atol=1e-3)
+    short = rest & (np.arange(len(rest)) < 150)
+    assert not resting_rate(rates, short, PERIOD).any()
+
+
+def test_a_change_is_that_of_a_sensor_to_the_farther_neighbour():
+    signal = np.zeros((5, 6))
+    signal[2, 0], signal[2, 4], signal[4, 3] = 3.0, 2.0, 4.0
+    expected = np.repeat([[0, 0], [3, 2], [3, 2], [3, 4], [0, 4]], 3, axis=1)
+    np.testing.assert_array_equal(sensor_changes(signal), expected)

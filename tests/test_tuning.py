@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsat.config import Config, Noise, config_toml, load_config
+from jaxsat.config import Config, Noise, Smoother, config_toml, load_config
 from jaxsat.errors import InputError
 from jaxsat.inertial.orientation import Gains, Start
 from jaxsat.inertial.strapdown import error_transition, sample_intervals, sample_noise, strapdown
@@ -28,8 +28,10 @@ from jaxsat.studies.tuning import (
 
 RATE, G = 100.0, 9.81
 LEVEL = Start(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), jnp.asarray(G))
-TRUE = Noise(gyr_density=2e-3, acc_density=2e-2, rest_velocity_sd=5e-3)
+TRUE = Noise(gyr_density=2e-3, acc_density=2e-2, change=0.0, rest_velocity_sd=5e-3)
 STANDARD = Config(method="standard")
+KNOWN = Smoother(gyr_offset="none", acc_bias_sd=0.0, lever_sd=0.0)
+"""Sensors without offsets, that rest where they are."""
 
 
 def of(noise: Noise) -> jax.Array:
@@ -73,14 +75,15 @@ def test_the_misfit_is_that_of_one_dense_gaussian():
     """Still but for noise, where the filter is linear: −log p of all velocities of the rests at once."""
     n, rng = 60, np.random.default_rng(0)
     axes = (1.0, 2.0, 0.5, 1.0, 3.0, 1.0)
-    noise = Noise(gyr_density=3e-5, acc_density=2e-4, axes=axes, rest_velocity_sd=1e-4, initial_tilt_sd=1e-5)
+    densities = {"gyr_density": 3e-5, "acc_density": 2e-4, "axes": axes, "change": 0.0}
+    noise = Noise(**densities, rest_velocity_sd=1e-4, initial_tilt_sd=1e-5)
     rest = np.ones(n, bool)
     rest[10:30] = rest[40:55] = False
     sd = np.array(noise.densities) * np.sqrt(RATE)
     signal = [0.0, 0.0, 0.0, 0.0, 0.0, G] + sd * rng.normal(size=(n, 6))
     time, missing = np.arange(n) / RATE, np.zeros((n, 6), bool)
     recording = Recording(time, signal[:, :3], signal[:, 3:], missing, rest)
-    trial = noise_trial(recording, Config(noise=noise, gravity=G))
+    trial = noise_trial(recording, Config(noise=noise, gravity=G, smoother=KNOWN))
     samples, _, prior, covariance, gravity = trial.problem(of(noise))
     np.testing.assert_allclose(samples.variance[:n], np.repeat(sd[None] ** 2, n, axis=0))
     reference = strapdown(samples.signal, samples.period, prior, gravity)
@@ -104,9 +107,9 @@ def test_the_misfit_is_that_of_one_dense_gaussian():
 
 def test_the_position_loss_is_the_error_of_the_estimate_with_that_noise(walk):
     recording, truth = walk
-    trial = noise_trial(recording, STANDARD, truth)
     for noise in (STANDARD.noise, TRUE):
-        found = estimate(recording, STANDARD.model_copy(update={"noise": noise}))
+        config = STANDARD.model_copy(update={"noise": noise})
+        trial, found = noise_trial(recording, config, truth), estimate(recording, config)
         expected = position_rmse(found.trajectory.position, truth[1]) ** 2
         assert float(jax.jit(position_loss)(trial, of(noise))) == pytest.approx(expected, rel=1e-6)
 
@@ -126,8 +129,8 @@ def test_gradients_are_those_of_finite_differences(walk, loss):
 
 def test_the_densities_of_a_simulated_recording_are_found(walk):
     recording, truth = walk
-    start = Noise(gyr_density=1e-2, acc_density=4e-3, rest_velocity_sd=2e-2)
-    trials = [noise_trial(recording, Config(method="standard", noise=start), truth)]
+    start = Noise(gyr_density=1e-2, acc_density=4e-3, change=0.0, rest_velocity_sd=2e-2)
+    trials = [noise_trial(recording, Config(method="standard", noise=start, smoother=KNOWN), truth)]
     tuned = tune_noise(trials, start, steps=40, rate=0.15)
     assert tuned.after < tuned.before
     np.testing.assert_allclose(of(tuned.noise) / of(TRUE), 1.0, atol=0.25)

@@ -45,8 +45,8 @@ class Calibration(eqx.Module):
         """Samples without the biases, and rests about the point that stands still."""
         signal = samples.signal - self.constants[None, :6]
         velocity = jnp.cross(self.constants[None, 6:], signal[:, :3])
-        known = Rows(rows.rest, rows.velocity_variance, rows.height, rows.height_variance, velocity)
-        return Samples(signal, samples.period, samples.variance), known
+        rows = eqx.tree_at(lambda r: r.velocity, rows, velocity, is_leaf=lambda x: x is None)
+        return Samples(signal, samples.period, samples.variance), rows
 
 
 def constants_quadratic(

@@ -44,7 +44,8 @@ class Trial(eqx.Module):
 
     def calibrated(self, calibration: Calibration) -> "Trial":
         """Without the biases, and resting about the point that stands still."""
-        samples, rows = calibration.applied(Samples(self.signal, self.period, self.variance), self.rows)
+        arrays = map(jnp.asarray, (self.signal, self.period, self.variance))
+        samples, rows = calibration.applied(Samples(*arrays), self.rows)
         return eqx.tree_at(lambda t: (t.signal, t.rows), self, (samples.signal, rows))
 
     def padded(self) -> "Trial":

@@ -1,5 +1,7 @@
 """A recording: what was measured, in SI units, with masks instead of NaN."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
@@ -46,13 +48,14 @@ class Recording(eqx.Module):
         return eqx.tree_at(lambda r: (r.gyr, r.acc), self, (signal[:, :3], signal[:, 3:]))
 
 
-def sensor_changes(signal: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 6"]:
+def sensor_changes(signal: Float[Any, "N 6"]) -> Float[Any, "N 6"]:
     """By how much each sensor's reading changes from a sample to one beside it, the larger of both; three axes alike.
 
     A sample stands for all its period, and a sensor that is turned reads on one axis what was on another: what is
-    wrong with a value grows with this (rad/s, m/s²).
+    wrong with a value grows with this (rad/s, m/s²). Of arrays of NumPy or of JAX.
     """
-    steps = np.linalg.norm(np.diff(signal, axis=0).reshape(-1, 2, 3), axis=2)
-    still = np.zeros((1, 2))
-    either = np.maximum(np.concatenate([still, steps]), np.concatenate([steps, still]))
-    return np.repeat(either, 3, axis=1)
+    xp = signal.__array_namespace__()
+    steps = xp.sqrt(xp.sum((signal[1:] - signal[:-1]).reshape(-1, 2, 3) ** 2, axis=2))
+    still = steps[:1] * 0.0
+    either = xp.maximum(xp.concat([still, steps]), xp.concat([steps, still]))
+    return xp.repeat(either, 3, axis=1)

@@ -28,6 +28,7 @@ from jaxsat.saturation.compensate import (
 from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
 from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
+from jaxsat.signals.recording import sensor_changes
 
 # Numbers of eight bytes that a call keeps alive for each sample (and for each further method that compensates), each
 # padded sample of a segment, and each of its padded saturated values; fitted to what XLA reports on a CPU for its
@@ -56,6 +57,8 @@ class Case(eqx.Module):
     departure: Int[Arrays, "S"]
     arrival: Int[Arrays, "S"]
     rest_end: Int[Arrays, "S"]
+    change: Float[Arrays, "6"]
+    """Share of a sensor's change between samples that is noise, of each channel."""
     length: Int[Arrays, ""]
     path: Float[Arrays, "N 3"]
     """Of the recording as given, by the standard smoother."""
@@ -74,6 +77,7 @@ def make_case(prepared: Prepared, busy: Int[np.ndarray, "B"], lanes: int, config
         departure=pad(segments.departure[busy], lanes),
         arrival=pad(segments.arrival[busy], lanes),
         rest_end=pad(rest_end[busy], lanes),
+        change=np.array(config.noise.changes),
         length=np.asarray(len(prepared.rest)),
         path=np.asarray(path),
     )
@@ -180,8 +184,12 @@ def score(
     way = jnp.sign(raw)
     sign = jnp.where(clipped, way.astype(whole.sign.dtype), whole.sign)
     signal = jnp.where(beyond, way * rail[None] - case.offset[None], whole.signal)
+    noisier = sensor_changes(signal) ** 2 - sensor_changes(whole.signal) ** 2
+    variance = whole.variance + jnp.where(measured(whole), case.change[None] ** 2 * noisier, 0.0)
     trial = eqx.tree_at(
-        lambda t: (t.signal, t.sign, t.clean, t.bound), whole, (signal, sign, whole.clean & ~clipped, bound)
+        lambda t: (t.signal, t.variance, t.sign, t.clean, t.bound),
+        whole,
+        (signal, variance, sign, whole.clean & ~clipped, bound),
     )
 
     def compared(path, filled):
@@ -208,9 +216,9 @@ def score(
         prior = signal_prior(trial) if option.method == "map" else None
 
         def once(before, _, option=option, prior=prior):
-            filled, extra, _, known = before
-            here = trial.calibrated(known)
-            filtered = filter_trial(here, filled - known.constants[None, :6], extra)
+            filled, extra, _, calibration = before
+            here = trial.calibrated(calibration)
+            filtered = filter_trial(here, filled - calibration.constants[None, :6], extra)
             states, covariances, _ = jax.tree.map(lambda x: x[at], filtered)
             table = _table(case, here) if bare is None else bare
             fill, values = solve_segments(
@@ -220,14 +228,14 @@ def score(
             way = sign.at[place].get(mode="fill", fill_value=0)
             filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")
             extra, slack = (unfilled.at[place].set(x, mode="drop") for x in (fill.variance, fill.slack))
-            known = _calibration(trial, filled, extra, wanted, 1, known)
-            return (filled, extra, slack, known), (fill, values)
+            calibration = _calibration(trial, filled, extra, wanted, 1, calibration)
+            return (filled, extra, slack, calibration), (fill, values)
 
         # A loop, not a repetition: the program is compiled once.
         begin = (signal, unfilled, unfilled, first)
-        (filled, _, slack, known), every = jax.lax.scan(once, begin, None, length=sweeps)
+        (filled, _, slack, calibration), every = jax.lax.scan(once, begin, None, length=sweeps)
         fill, values = jax.tree.map(lambda x: x[-1], every)
-        path = _smooth_path(trial, filled, trial.variance + slack, known, relinearisations)
+        path = _smooth_path(trial, filled, trial.variance + slack, calibration, relinearisations)
         busy = jnp.any(values.sample < count, axis=1)
         order = jnp.asarray([_SEVERITY.index(status) for status in sorted(Status)])
         worst = jnp.max(jnp.where(busy, order[fill.solution.status], 0))
@@ -258,8 +266,10 @@ def _table(case: Case, trial: Trial) -> Float[Array, "S 10 10"]:
     return arrivals(samples, trial.rows, case.arrival, case.rest_end, longest)
 
 
-def _smooth_path(trial: Trial, signal, variance, known: Calibration, relinearisations) -> Float[Array, "N 3"]:
-    samples, rows = known.applied(Samples(signal, jnp.asarray(trial.period), variance), trial.rows)
+def _smooth_path(
+    trial: Trial, signal, variance, calibration: Calibration, relinearisations
+) -> Float[Array, "N 3"]:
+    samples, rows = calibration.applied(Samples(signal, jnp.asarray(trial.period), variance), trial.rows)
     smoothed = smooth(
         samples,
         rows,
@@ -274,5 +284,5 @@ def _smooth_path(trial: Trial, signal, variance, known: Calibration, relinearisa
 @compiled
 def _standard(trial: Trial, wanted, relinearisations) -> Float[Array, "N 3"]:
     trial = jax.tree.map(jnp.asarray, trial)
-    known = _calibration(trial, trial.signal, trial.unfilled_variance, wanted)
-    return _smooth_path(trial, trial.signal, trial.variance, known, relinearisations)
+    calibration = _calibration(trial, trial.signal, trial.unfilled_variance, wanted)
+    return _smooth_path(trial, trial.signal, trial.variance, calibration, relinearisations)

@@ -30,7 +30,8 @@ from jaxsat.inertial.strapdown import (
     sample_intervals,
     sample_noise,
 )
-from jaxsat.preparation import prepare
+from jaxsat.pipeline import calibrate_by_rests
+from jaxsat.preparation import prepare, without_floor
 from jaxsat.saturation.layout import Trial, pad
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.metrics import Track
@@ -102,6 +103,7 @@ class NoiseTrial(eqx.Module):
     """A recording as the standard smoother takes it, with what its noise is made of."""
 
     trial: Trial
+    """Calibrated with the noise that tuning starts from."""
     measured: Bool[np.ndarray, "N 6"]
     """The variance of the value is that of the sensor's density and of its changes."""
     extra: Float[np.ndarray, "N 6"]
@@ -144,6 +146,8 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
     """
     with jax.enable_x64(True):
         prepared = prepare(recording, config)
+        known = calibrate_by_rests(without_floor(prepared.trial, config), config)
+        trial = jax.tree.map(np.asarray, prepared.trial.calibrated(known))
     n, size = len(recording), len(prepared.trial.signal)
     extra = prepared.trial.variance[:n] - np.array(config.noise.densities) ** 2 / recording.period
     position, scored = np.zeros((n, 3)), np.zeros(n, bool)
@@ -157,7 +161,7 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
                 f"recording's {recording.time[0]:.3f} to {recording.time[-1]:.3f} s; put both on one clock."
             )
     return NoiseTrial(
-        prepared.trial,
+        trial,
         pad(~recording.missing, size),
         pad(extra, size),
         np.array(config.noise.axes),

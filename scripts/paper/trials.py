@@ -41,9 +41,14 @@ def settings(name: str, quick: bool = False) -> Settings:
 
 def config_of(chosen: Settings, **changes: Any) -> Config:
     """Its configuration for simulated recordings, with some sections changed: `rails={"gyr": 5.0}`."""
-    # The smoother is told the noise of the sensor.
+    # The smoother is told the noise of the sensor, which is white.
     sensor = Sensor()
-    noise = {"gyr_density": sensor.gyr_density, "acc_density": sensor.acc_density, "rest_velocity_sd": 0.01}
+    noise = {
+        "gyr_density": sensor.gyr_density,
+        "acc_density": sensor.acc_density,
+        "change": 0.0,
+        "rest_velocity_sd": 0.01,
+    }
     return Config.model_validate({"noise": noise, **chosen["config"], **changes})
 
 
