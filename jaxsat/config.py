@@ -25,9 +25,8 @@ class _Section(BaseModel):
 class Noise(_Section):
     """Noise of the sensors as densities, with what no model of them says (scale, axes), and how still a rest is.
 
-    Chosen on recordings that do not saturate: the 14 such PyShoe trials, of which the position RMSE of `standard` is
-    least at densities of a tenth of `rest_velocity_sd`, and the gaitmap walk, which wants an accelerometer five times
-    noisier. Their common size is such that J* is about half of its number of rows.
+    Chosen by the position RMSE of `standard` on recordings that do not saturate: the 14 such PyShoe trials and the
+    gaitmap walk (`CHANGELOG.md`). Only ratios of these matter to the path, but for what saturates.
     """
 
     gyr_density: float = Field(default=1e-3, gt=0, description="angular-rate noise density (rad/s/√Hz)")

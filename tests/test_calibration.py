@@ -10,7 +10,7 @@ import pytest
 from jaxsat.config import load_config
 from jaxsat.inertial.calibration import Calibration, calibrate, constants_quadratic
 from jaxsat.inertial.rotations import quat_to_matrix
-from jaxsat.inertial.smoother import Rows, closed_loop, smooth, smooth_about
+from jaxsat.inertial.smoother import Rows, closed_loop, smooth
 from jaxsat.inertial.strapdown import (
     NavState,
     Samples,
@@ -39,20 +39,18 @@ def problem():
     prior, covariance = problems.departure()
     samples = problems.samples(N)
     reference = closed_loop(samples, rows, prior, covariance, problems.GRAVITY).state
-    # The quadratic has its prior at the first state of the reference.
-    reference = jax.tree.map(lambda x, first: x.at[0].set(first), reference, prior)
     return reference, samples, rows, prior, covariance
 
 
-def test_without_constants_the_quadratic_is_the_cost_of_the_smoother(problem):
-    reference, samples, rows, _, covariance = problem
-    found = jax.jit(constants_quadratic)(reference, samples, rows, covariance, problems.GRAVITY)
-    cost = jax.jit(smooth_about)(reference, samples, rows, *problem[3:], problems.GRAVITY).cost
+def test_without_constants_the_quadratic_is_the_cost_of_the_filter(problem):
+    _, samples, rows, prior, covariance = problem
+    found = jax.jit(constants_quadratic)(samples, rows, prior, covariance, problems.GRAVITY)
+    cost = closed_loop(samples, rows, prior, covariance, problems.GRAVITY).cost.sum()
     assert 0.5 * found[0, 0] == pytest.approx(float(cost), rel=1e-9)
     np.testing.assert_allclose(found, found.T, rtol=1e-12)
 
 
-def dense_cost(reference, samples: Samples, rows: Rows, covariance):
+def dense_cost(reference, samples: Samples, rows: Rows, prior: NavState, covariance):
     """J of the offsets of all steps about a fixed reference, by one dense Gaussian of all states."""
     intervals = sample_intervals(samples.signal, samples.period)
     at = reference.q_nb[:-1]
@@ -68,12 +66,19 @@ def dense_cost(reference, samples: Samples, rows: Rows, covariance):
     rest = np.flatnonzero(rows.rest)
     H = np.concatenate([9 * k + np.arange(6, 9) for k in rest])
     S = C[np.ix_(H, H)] + float(rows.velocity_variance[0]) * np.eye(len(H))
-    R, turning = jax.vmap(quat_to_matrix)(at), samples.signal[:, :3]
+    # Rows are linearised about what the filter predicts.
+    predicted = jax.vmap(lambda a, i: advance(a, i, problems.GRAVITY).q_nb)(
+        jax.tree.map(lambda x: x[:-2], reference), jax.tree.map(lambda x: x[:-1], intervals)
+    )
+    R = jax.vmap(quat_to_matrix)(jnp.concatenate([prior.q_nb[None], predicted]))
+    first = error_between(prior, jax.tree.map(lambda x: x[0], reference))
+    turning = samples.signal[:, :3]
 
     def cost(offsets, lever) -> float:
         moves = np.einsum("kij,kj->ki", R, rows.velocity + np.cross(lever, turning))
         measured = (moves - np.asarray(reference.velocity)[:-1])[rest].ravel()
         mean = np.zeros((N + 1, 9))
+        mean[0] = first
         for k in range(N):
             mean[k + 1] = transitions[k] @ mean[k] + offsets[k]
         innovation = measured - mean.ravel()[H]
@@ -84,8 +89,8 @@ def dense_cost(reference, samples: Samples, rows: Rows, covariance):
 
 def test_gradient_and_hessian_equal_differences_of_a_dense_cost(problem):
     """The effect of a bias on each step is taken from the strapdown itself, by central differences."""
-    reference, samples, rows, _, covariance = problem
-    found = np.asarray(jax.jit(constants_quadratic)(reference, samples, rows, covariance, problems.GRAVITY))
+    reference, samples, rows, prior, covariance = problem
+    found = np.asarray(jax.jit(constants_quadratic)(samples, rows, prior, covariance, problems.GRAVITY))
     start, end = (jax.tree.map(lambda x, s=s: x[s], reference) for s in (slice(None, -1), slice(1, None)))
 
     @jax.jit
@@ -97,7 +102,7 @@ def test_gradient_and_hessian_equal_differences_of_a_dense_cost(problem):
 
     zero, h = jnp.zeros(6), 1e-4
     effect = np.stack([(offsets(h * e) - offsets(-h * e)) / (2 * h) for e in np.eye(6)], axis=-1)
-    of_offsets, unbiased = dense_cost(reference, samples, rows, covariance), np.asarray(offsets(zero))
+    of_offsets, unbiased = dense_cost(reference, samples, rows, prior, covariance), np.asarray(offsets(zero))
 
     def cost(constants):
         return of_offsets(unbiased + effect @ constants[:6], constants[6:])

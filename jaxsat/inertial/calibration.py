@@ -12,21 +12,28 @@ variances is the cost as a quadratic in c. Its minimum is what the smoother with
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial import kalman
 from jaxsat.inertial.dense import inverse_positive
 from jaxsat.inertial.rotations import quat_exp, quat_multiply, quat_to_matrix, skew
-from jaxsat.inertial.smoother import VELOCITY, Rows, linearised, smooth
+from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import (
     NavState,
     Samples,
+    add_error,
+    advance,
     error_transition,
+    sample_intervals,
     sample_noise,
 )
 
 CONSTANTS = 9
 """Biases of gyroscope and accelerometer (rad/s, m/s²), and the lever (m)."""
+
+# Velocity rows see [θ, v] of [θ, r, v].
+_SEEN = np.array([0, 1, 2, 6, 7, 8])
 
 
 class Calibration(eqx.Module):
@@ -50,57 +57,54 @@ class Calibration(eqx.Module):
 
 
 def constants_quadratic(
-    reference: NavState,
     samples: Samples,
     rows: Rows,
-    prior_covariance: Float[Array, "9 9"],
+    prior: NavState,
+    prior_covariance: Float[Array, "p p"],
     gravity: Float[Array, ""],
 ) -> Float[Array, "10 10"]:
     """Λ with J(c) = ½ [1; c]ᵀ Λ [1; c], c being what is left of the constants in samples and rows.
 
-    reference: N+1 states to linearise about; height rows are not used.
+    Linearised about the states of the filter (`closed_loop`), of which attitude and velocity alone are needed: height
+    rows are not used.
     """
-    start, intervals, offsets = linearised(reference, samples, gravity)
 
     def step(carry, inputs):
-        mean, covariance, total = carry
-        state, interval, sample, offset, row = inputs
+        state, covariance, moved, total = carry
+        interval, sample, row = inputs
         # A lever that is left moves the sensor at rest by ℓ × ω.
-        moves = quat_to_matrix(state.q_nb) @ skew(sample.signal[:3])
-        for axis, (index, misfit) in enumerate(zip(VELOCITY, row.misfit(state), strict=True)):
-            column = covariance[:, index]
-            weight = jnp.where(row.rest, 1.0 / (column[index] + row.velocity_variance), 0.0)
-            innovation = (-mean[index]).at[0].add(misfit).at[7:].add(-moves[axis])
+        lever = quat_to_matrix(state.q_nb) @ skew(sample.signal[:3])
+        mean = jnp.concatenate([jnp.zeros((6, 1)), moved], axis=1)
+        for axis, misfit in enumerate(row.misfit(state)):
+            column = covariance[:, 3 + axis]
+            weight = jnp.where(row.rest, 1.0 / (column[3 + axis] + row.velocity_variance), 0.0)
+            innovation = (-mean[3 + axis]).at[0].add(misfit).at[7:].add(-lever[axis])
             total = total + weight * jnp.outer(innovation, innovation)
             mean = mean + weight * jnp.outer(column, innovation)
             covariance = covariance - weight * jnp.outer(column, column)
+        state = add_error(state, jnp.zeros(9).at[_SEEN].set(mean[:, 0]))
         transition = error_transition(state.q_nb, interval)
-        # A bias that is there turns and pushes the reference too much.
+        # A bias that is there turns and pushes too much.
         middle = quat_multiply(state.q_nb, quat_exp(0.5 * sample.period * sample.signal[:3]))
         turned, zero = -quat_to_matrix(middle) * sample.period, jnp.zeros((3, 3))
-        rate = jnp.concatenate([turned, zero, zero])
-        force = jnp.concatenate([zero, 0.5 * sample.period * turned, turned])
-        shift, covariance = kalman.predict(
-            mean[:, 0],
-            covariance,
-            transition.forth,
-            offset,
-            sample_noise(state.q_nb, sample.signal, sample.period, sample.variance),
-        )
-        moved = transition.forth(mean[:, 1:]) + jnp.concatenate([rate, force, jnp.zeros((9, 3))], axis=1)
-        return (jnp.concatenate([shift[:, None], moved], axis=1), covariance, total), None
+        biases = jnp.block([[turned, zero, zero], [zero, turned, zero]])
+        noise = sample_noise(state.q_nb, sample.signal, sample.period, sample.variance)[_SEEN][:, _SEEN]
+        nothing = jnp.zeros(6)
+        _, covariance = kalman.predict(nothing, covariance, transition.forth, nothing, noise)
+        moved = transition.forth(mean[:, 1:]) + biases
+        return (advance(state, interval, gravity), covariance, moved, total), None
 
-    size = 1 + CONSTANTS
-    carry = (jnp.zeros((9, size)), prior_covariance, jnp.zeros((size, size)))
-    (_, _, total), _ = jax.lax.scan(step, carry, (start, intervals, samples, offsets, rows))
-    return total
+    known = prior_covariance if len(prior_covariance) == 6 else prior_covariance[_SEEN][:, _SEEN]
+    carry = (prior, known, jnp.zeros((6, CONSTANTS)), jnp.zeros((1 + CONSTANTS, 1 + CONSTANTS)))
+    intervals = sample_intervals(samples.signal, samples.period)
+    return jax.lax.scan(step, carry, (intervals, samples, rows))[0][3]
 
 
 def calibrate(
     samples: Samples,
     rows: Rows,
     prior: NavState,
-    prior_covariance: Float[Array, "9 9"],
+    prior_covariance: Float[Array, "p p"],
     gravity: Float[Array, ""],
     sd: Float[Array, "9"],
     steps: Int[Array, ""] | int,
@@ -114,9 +118,7 @@ def calibrate(
     scale = jnp.maximum(sd, 1e-12)
 
     def step(_, now: Calibration) -> Calibration:
-        left, known = now.applied(samples, rows)
-        reference = smooth(left, known, prior, prior_covariance, gravity, 0).state
-        quadratic = constants_quadratic(reference, left, known, prior_covariance, gravity)
+        quadratic = constants_quadratic(*now.applied(samples, rows), prior, prior_covariance, gravity)
         # In units of the prior, where the Hessian is at least the identity.
         hessian = jnp.eye(CONSTANTS) + quadratic[1:, 1:] * scale[:, None] * scale[None]
         gradient = now.constants / scale + quadratic[1:, 0] * scale
