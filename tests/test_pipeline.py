@@ -13,6 +13,7 @@ from jaxsat.config import load_config
 from jaxsat.errors import InputError
 from jaxsat.pipeline import estimate
 from jaxsat.preparation import LATEST_FIRST_REST
+from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table
 from jaxsat.saturation import compensate
 from jaxsat.saturation.compensate import signal_prior
@@ -287,3 +288,22 @@ def test_an_axis_may_be_noisier_than_its_sensor():
         load_config(None, **{"noise.axes": [1.0, 2.0, 3.0]})
     with pytest.raises(InputError, match=r"noise\.axes"):
         load_config(None, **{"noise.axes": [1.0, 2.0, 3.0, 1.0, 0.0, 1.0]})
+
+
+def test_what_is_learned_of_the_sensors_is_said():
+    """An accelerometer's bias, within what is said of it; none that is not wanted, no lever where nothing rolls."""
+    bias = np.array([0.05, -0.03, 0.02])
+    recording, truth = walk(6, acc_bias=bias)
+    told = {"noise.gyr_density": 7e-4, "noise.acc_density": 7e-3, "noise.change": 0.0, "gravity": 9.80665}
+    given = {"method": "standard", "rails.gyr": "none", "rails.acc": "none", "smoother.gyr_offset": "none"}
+    found, blind = (
+        estimate(recording, load_config(None, **told, **given, **x))
+        for x in ({}, {"smoother.acc_bias_sd": 0.0})
+    )
+    said = summarise(found)
+    learned, sd = (np.array(list(said[name].values())) for name in ("bias", "bias_sd"))
+    assert (np.abs(learned[3:] - bias) < 4 * sd[3:]).all() and abs(learned[5] - bias[2]) < 0.01
+    assert not learned[:3].any() and not sd[:3].any()
+    assert (np.abs(said["lever"]) < 4 * np.array(said["lever_sd"])).all()
+    errors = [position_rmse(x.trajectory.position, truth.position) for x in (found, blind)]
+    assert errors[0] < errors[1]
