@@ -23,8 +23,8 @@ STRIDE, CONTRAST = 1.5, 10.0
 # A rest of at least this length (s) says what a gyroscope reads when nothing turns, and how sure that is by the means
 # of blocks of about `BLOCK`: who wears a sensor sways and settles within half a second.
 SHORTEST_OFFSET_REST, BLOCK = 1.0, 0.5
-# sd of the offset of a calibrated MEMS gyroscope (rad/s); one that is larger is believed where it exceeds what the
-# sway of the rests can be by `CLEAR` sd.
+# sd of the offset of a calibrated MEMS gyroscope (rad/s); what exceeds the sway of the rests by `CLEAR` sd is taken
+# as it is.
 OFFSET_SD, CLEAR = 3e-3, 2.0
 
 
@@ -147,9 +147,8 @@ def resting_rate(
     """Offset of a gyroscope from its mean rates at rests (rad/s), each axis by itself.
 
     A foot that stands turns by a degree, which within a second passes for a large offset. So each rest counts by
-    the variance of its mean, from the means of its blocks, and the offset is shrunk by a prior: that of a calibrated
-    sensor, or what the rests show beyond their sway where that is larger (empirical Bayes). Zero where no rest is
-    long enough.
+    the variance of its mean, from the means of its blocks, and an offset that is not clear of the sway is shrunk by
+    what is expected of a calibrated sensor. Zero where no rest is long enough.
     """
     edge, weight, total = round(0.1 / period), np.zeros(3), np.zeros(3)
     for start, end in zip(*runs(rest), strict=True):
@@ -164,5 +163,5 @@ def resting_rate(
     if not weight.any():
         return total
     mean, variance = total / weight, 1.0 / weight
-    prior = np.maximum(OFFSET_SD**2, mean**2 - CLEAR**2 * variance)
-    return mean * prior / (prior + variance)
+    clear = np.abs(mean) > CLEAR * np.sqrt(variance)
+    return np.where(clear, mean, mean * OFFSET_SD**2 / (OFFSET_SD**2 + variance))
