@@ -22,7 +22,7 @@ from jaxsat.inertial.smoother import (
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.preparation import prepare_recording, without_floor
+from jaxsat.preparation import prepare, without_floor
 from jaxsat.saturation.compensate import (
     FIRST_STEPS,
     Fills,
@@ -133,7 +133,7 @@ def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
 
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
     clock = _Clock()
-    prepared = prepare_recording(recording, config)
+    prepared = prepare(recording, config)
     trial, segments, gaps = prepared.trial, prepared.segments, prepared.gaps
     clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))

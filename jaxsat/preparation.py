@@ -50,11 +50,10 @@ class Prepared(eqx.Module):
 def prepare(recording: Recording, config: Config) -> Prepared:
     """All that is done to a recording before it is smoothed; raises `InputError` as `estimate` does."""
     with jax.enable_x64(True):
-        return prepare_recording(recording, config)
+        return _prepare(recording, config)
 
 
-def prepare_recording(recording: Recording, config: Config) -> Prepared:
-    """`prepare` where float64 is on already."""
+def _prepare(recording: Recording, config: Config) -> Prepared:
     make_room()
     warnings = check(recording)
     rails = find_rails(recording, config.rails.gyr, config.rails.acc)
