@@ -26,7 +26,7 @@ class Noise(_Section):
     """Noise of the sensors as densities, with what no model of them says (scale, axes), and how still a rest is.
 
     Chosen by the position RMSE of `standard` on recordings that do not saturate: the 14 such PyShoe trials and the
-    gaitmap walk (`CHANGELOG.md`). Only ratios of these matter to the path, but for what saturates.
+    gaitmap walk (`CHANGELOG.md`).
     """
 
     gyr_density: float = Field(default=1e-3, gt=0, description="angular-rate noise density (rad/s/√Hz)")
