@@ -59,19 +59,23 @@ def predict(
 
 
 class Adjoint(eqx.Module):
-    """What all later rows say about a state: mean_s = mean − P·gradient, P_s = P − P·curvature·P."""
+    """What all later rows say about a state: mean_s = mean − P·gradient, P_s = P − P·curvature·P.
+
+    Of states on which nothing later depends it is zero, so they may be left out."""
 
     gradient: Float[Array, "n"]
     curvature: Float[Array, "n n"]
 
 
-def adjoint_row(adjoint: Adjoint, index: int, row: Row) -> tuple[Adjoint, Float[Array, ""]]:
-    """Add one row to the adjoint; also returns its multiplier dJ*/dz."""
-    multiplier = row.gain @ adjoint.gradient + row.weighted
+def adjoint_row(
+    adjoint: Adjoint, index: int, gain: Float[Array, "n"], row: Row
+) -> tuple[Adjoint, Float[Array, ""]]:
+    """Add one row to the adjoint; also returns its multiplier dJ*/dz. gain: `row`'s, of the adjoint's states."""
+    multiplier = gain @ adjoint.gradient + row.weighted
     # CᵀΛC + h hᵀ/s with C = I − K hᵀ differs from Λ in row and column `index` only.
-    pulled = adjoint.curvature @ row.gain
+    pulled = adjoint.curvature @ gain
     curvature = adjoint.curvature.at[index, :].add(-pulled).at[:, index].add(-pulled)
-    curvature = curvature.at[index, index].add(row.gain @ pulled + row.weight)
+    curvature = curvature.at[index, index].add(gain @ pulled + row.weight)
     return Adjoint(adjoint.gradient.at[index].add(-multiplier), curvature), multiplier
 
 
@@ -82,8 +86,11 @@ def adjoint_transition(adjoint: Adjoint, back: Linear) -> Adjoint:
 
 
 def condition_on_future(
-    mean: Float[Array, "n"], covariance: Float[Array, "n n"], adjoint: Adjoint
+    mean: Float[Array, "n"], covariance: Float[Array, "n n"], columns: Float[Array, "n k"], adjoint: Adjoint
 ) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
-    """Smoothed mean and covariance from the filtered ones."""
-    smoothed = covariance - covariance @ adjoint.curvature @ covariance
-    return mean - covariance @ adjoint.gradient, 0.5 * (smoothed + smoothed.T)
+    """Smoothed mean and covariance from the filtered ones.
+
+    columns: those of the covariance that belong to the adjoint's states; on the others nothing later depends.
+    """
+    smoothed = covariance - columns @ adjoint.curvature @ columns.T
+    return mean - columns @ adjoint.gradient, 0.5 * (smoothed + smoothed.T)

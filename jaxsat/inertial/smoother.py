@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial import kalman
@@ -186,14 +187,18 @@ def smooth_about(
         )
         return (*predicted, cost + extra), (mean, covariance, row)
 
+    # Where no height is observed nothing that comes later depends on position.
+    seen = slice(0, 9) if rows.height is not None else np.array([0, 1, 2, *VELOCITY])
+    size = 6 if rows.height is None else 9
+
     def backward(adjoint, inputs):
         state, interval, mean, covariance, row = inputs
         adjoint = kalman.adjoint_transition(adjoint, error_transition(state.q_nb, interval).back)
-        smoothed = kalman.condition_on_future(mean, covariance, adjoint)
+        smoothed = kalman.condition_on_future(mean, covariance, covariance[:, seen], adjoint)
         multiplier = None
-        for index, done in reversed(list(zip(_observed(rows, 9), row, strict=True))):
-            adjoint, pull = kalman.adjoint_row(adjoint, index, done)
-            multiplier = pull if index == HEIGHT else multiplier
+        for index, done in reversed(list(zip(_observed(rows, size), row, strict=True))):
+            adjoint, pull = kalman.adjoint_row(adjoint, index, done.gain[seen], done)
+            multiplier = pull if size == 9 and index == HEIGHT else multiplier
         return adjoint, (*smoothed, multiplier)
 
     initial_error = error_between(prior, jax.tree.map(lambda x: x[0], reference))
@@ -203,7 +208,7 @@ def smooth_about(
         (initial_error, prior_covariance, zero),
         (start, intervals, samples, offsets, rows),
     )
-    nothing = kalman.Adjoint(jnp.zeros_like(last_mean), jnp.zeros_like(last_covariance))
+    nothing = kalman.Adjoint(jnp.zeros(size, last_mean.dtype), jnp.zeros((size, size), last_mean.dtype))
     _, (error, smoothed, multiplier) = jax.lax.scan(
         backward, nothing, (start, intervals, mean, covariance, row), reverse=True
     )

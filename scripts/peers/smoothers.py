@@ -75,7 +75,6 @@ def walking_trials(trials: int, count: int) -> WalkingTrials:
     start = NavState(jnp.asarray(truth.q_nb[0]), jnp.zeros(3), jnp.zeros(3))
     prior = jax.tree.map(lambda x: jnp.broadcast_to(x, (trials, *x.shape)), start)
     speed = jnp.asarray(noise.rest_velocity_sd**2)
-    no_height = jnp.zeros((trials, count), bool)
     rest = jnp.broadcast_to(jnp.asarray(truth.rest), (trials, count))
     one = jnp.ones((trials, count))
     return WalkingTrials(
@@ -83,7 +82,7 @@ def walking_trials(trials: int, count: int) -> WalkingTrials:
         reference=jax.jit(jax.vmap(partial(strapdown, gravity=jnp.asarray(GRAVITY))))(
             samples.signal, samples.period, prior
         ),
-        rows=Rows(rest, speed * one, no_height, one),
+        rows=Rows(rest, speed * one, None, one),
         prior=prior,
         prior_covariance=jnp.diag(jnp.array([noise.initial_tilt_sd**2] * 2 + [0.0] * 4 + [speed] * 3)),
     )
