@@ -85,7 +85,9 @@ class Saturation(_Section):
     )
     acc_bound: float = Field(default=100.0, gt=0, description="the same for specific force (m/s²)")
     segments: Literal["parallel", "sequential"] = "parallel"
-    sweeps: int = Field(default=2, ge=1, le=20, description="passes over all segments when they are parallel")
+    sweeps: Literal["auto"] | Annotated[int, Field(ge=1, le=20)] = Field(
+        default="auto", description="passes over all segments when they are parallel; auto: 2, with map 3"
+    )
     free_peak_time: bool = Field(
         default=False, description="search the peak time of a triangle or parabola too"
     )
@@ -96,6 +98,10 @@ class Saturation(_Section):
         default=1e-2, gt=0, description="largest accepted optimality residual (scaled, per variable)"
     )
     max_iterations: int = Field(default=1000, ge=1)
+
+    def passes(self, method: str) -> int:
+        """`sweeps` in numbers; the first of `map` teaches the others what gaps lose."""
+        return {"map": 3}.get(method, 2) if self.sweeps == "auto" else self.sweeps
 
 
 class Height(_Section):

@@ -148,7 +148,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         report = partial(progress, "segments")
         given = searched, segments, options, calibration
         if config.saturation.segments == "parallel":
-            fills, calibration = compensate_parallel(*given, config.saturation.sweeps, report)
+            fills, calibration = compensate_parallel(*given, config.saturation.passes(config.method), report)
         else:
             fills, calibration = compensate_sequential(*given, report)
         clock.lap("compensation")
@@ -167,7 +167,8 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     n = len(recording)
 
     def sampled(f):
-        return f.signal, f.variance, f.slack, f.sd, f.gap_sd, f.identified, f.at_bound, f.inflated
+        named = f.signal, f.variance, f.slack, f.sd, f.gap_sd, f.identified, f.at_bound, f.inflated
+        return *named, *jax.tree.leaves(f.heard)
 
     fills = eqx.tree_at(sampled, fills, [x[:n] for x in sampled(fills)])
     if floor is not None:

@@ -13,6 +13,7 @@ from jaxsat.inertial.programs import UNOPTIMISED, stored_jit
 from jaxsat.inertial.smoother import Filtered, closed_loop
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
+from jaxsat.saturation.experience import Heard, experienced
 from jaxsat.saturation.layout import (
     Arrays,
     Sizes,
@@ -52,6 +53,10 @@ class Fills(eqx.Module):
     """Of the sum over the gap that a filled value lies in; NaN where the method does not say."""
     identified: Float[np.ndarray, "N 6"]
     """Share of the variance of that sum that the rests removed; NaN where the method does not say."""
+    heard: Heard
+    """[N, 6] each: `Uncertainty.heard`; nothing where the method does not say."""
+    asked: Float[np.ndarray, "S"]
+    """Of each segment: `Uncertainty.asked`, and NaN."""
     rank: Int[np.ndarray, "S"]
     """Of each segment: `Uncertainty.rank`, and 0 for methods without uncertainty."""
     arrival: Float[np.ndarray, "S 6"]
@@ -77,6 +82,8 @@ class Fills(eqx.Module):
             sd=np.zeros(shape),
             gap_sd=np.full(shape, np.nan),
             identified=np.full(shape, np.nan),
+            heard=Heard(np.zeros(shape), np.full(shape, np.inf), np.zeros(shape)),
+            asked=np.full(count, np.nan),
             rank=np.zeros(count, int),
             arrival=np.full((count, 6), np.nan),
             at_bound=np.zeros(shape, bool),
@@ -106,6 +113,9 @@ class Fills(eqx.Module):
         if (known := found.uncertainty) is not None:
             self.sd[sample, channel], self.gap_sd[sample, channel] = known.sd[real], known.gap_sd[real]
             self.identified[sample, channel] = known.identified[real]
+            for whole, part in zip(jax.tree.leaves(self.heard), jax.tree.leaves(known.heard), strict=True):
+                whole[sample, channel] = part[real]
+            self.asked[segments] = known.asked
             self.rank[segments], self.arrival[segments] = known.rank, known.arrival
         self.status[segments] = found.solution.status
         self.cost_before[segments], self.cost_after[segments] = found.cost_before, found.solution.value
@@ -176,6 +186,7 @@ calibrate_recording = stored_jit(calibrate_trial)
 filter_recording = stored_jit(filter_trial)
 _solve = stored_jit(solve_segments)
 _prior = stored_jit(signal_prior, UNOPTIMISED)
+_experienced = stored_jit(experienced, UNOPTIMISED)
 
 
 @stored_jit
@@ -214,10 +225,12 @@ def compensate_parallel(
     segments: Segments,
     options: Options,
     calibration: Calibration,
-    sweeps: int = 2,
+    sweeps: int,
     progress: Progress | None = None,
 ) -> tuple[Fills, Calibration]:
     """Solve each segment on its own from one filter pass over the recording; then again with the filled signal.
+
+    `map` also learns from each sweep what gaps like a gap lost.
 
     calibration: to begin with; the one that goes with the fills is returned with them.
     """
@@ -239,6 +252,9 @@ def compensate_parallel(
             if progress:
                 progress(done, sweeps * total)
         calibration = recalibrated(trial, fills, options, calibration)
+        if prior is not None:
+            taught = _experienced(prior.experience, trial.sign, fills.heard, fills.asked)
+            prior = eqx.tree_at(lambda p: p.experience, prior, taught)
     return fills, calibration
 
 

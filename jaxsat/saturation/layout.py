@@ -145,8 +145,11 @@ def gather(
         height = (arrival < count) & jnp.asarray(trial.rows.height)[jnp.minimum(arrival, count - 1)]
     place = Values(jnp.where(valid, start + sample, count), channel)
     way = jnp.where(valid, sign[sample, channel], 0).astype(signal.dtype)
-    known = None
+    known, height_variance = None, jnp.asarray(trial.rows.height_variance)[jnp.clip(arrival, 0, count - 1)]
     if prior is not None:
+        noise = prior.experience.noise
+        variance, covariance, height_variance = (noise * x for x in (variance, covariance, height_variance))
+        table = table / noise
         known = of_values(prior, jnp.asarray(trial.signal), start + sample, channel, way, gap)
     segment = Segment(
         signal=signal,
@@ -164,7 +167,7 @@ def gather(
         departure_covariance=covariance,
         arrival=table,
         height=height,
-        height_variance=jnp.asarray(trial.rows.height_variance)[jnp.clip(arrival, 0, count - 1)],
+        height_variance=height_variance,
         known=known,
     )
     return segment, place

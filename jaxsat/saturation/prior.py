@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.dense import inverse_positive, solve_positive
+from jaxsat.saturation.experience import NODES, Experience, habit, length_weights, with_habit
 
 # Terms that predict the second difference. Of 1, 2, 4 and 6 terms four filled the long gaps of the PyShoe walks of
 # the list `clip` best (clipped at 250 °/s) and two the short ones (350 °/s), compared before `WIDTH` was per gap.
@@ -29,8 +30,6 @@ WIDTH = 0.5
 # rests on the movement that is left being as lively as what was lost. On the walks of the list `clip`, clipped at
 # 350, 250 and 200 °/s, half of the gaps lost at least 30 to 100 % more or less than the prior alone says, by length.
 SHARE = 0.3
-# Lengths (samples) of the peaks that are hidden and filled, to see how far off the prior is; each twice the last.
-NODES = (1, 2, 4, 8, 16, 32, 64)
 # A hidden peak stands above so much of the rail at least.
 LEAST_LEVEL = 0.25
 # As if so many hidden peaks at the rail had been as far off as the prior says.
@@ -40,14 +39,16 @@ CREDIT = 2.0
 class SignalPrior(eqx.Module):
     """The prior of six channels."""
 
-    kernel: Float[Array, "*six K"]
+    kernel: Float[Array, "6 K"]
     """c(0), c(1), … of each channel, in 1/(its unit)²."""
-    innovation: Float[Array, "*six"]
+    innovation: Float[Array, "6"]
     """σ², the variance of a sample given all before it."""
-    excess: Float[Array, "*six L"]
+    excess: Float[Array, "6 L"]
     """By how much the squares of the errors of hidden peaks exceed what the prior says, by length (`NODES`)."""
-    harmful: Bool[Array, "*six L"]
+    harmful: Bool[Array, "6 L"]
     """Whether hidden peaks of that length were further off filled than cut off."""
+    experience: Experience
+    """What the search before taught; with none of it at first."""
 
 
 def learn(
@@ -62,12 +63,11 @@ def learn(
     The normal equations carry a weak prior at zero coefficients, which is the second-difference prior.
     """
     reach = jnp.asarray(REACH / period, int)
-    return jax.vmap(lambda x, s, ok: _learn_channel(x, s != 0, ok & moving, reach), in_axes=1)(
-        signal, sign, clean
-    )
+    channels = jax.vmap(lambda x, s, ok: _learn_channel(x, s != 0, ok & moving, reach), in_axes=1)
+    return SignalPrior(*channels(signal, sign, clean), Experience.none())
 
 
-def _learn_channel(x, saturated, ok, reach) -> SignalPrior:
+def _learn_channel(x, saturated, ok, reach):
     steps = jnp.arange(len(x))
     # Distance to the nearest saturated sample, by running maxima from both sides.
     behind = steps - jax.lax.cummax(jnp.where(saturated, steps, -len(x)))
@@ -94,7 +94,7 @@ def _learn_channel(x, saturated, ok, reach) -> SignalPrior:
     kernel = jnp.stack([jnp.sum(predictor[: size - k] * predictor[k:]) for k in range(size)])
     kernel = kernel / innovation
     excess, harmful = hidden_peaks(x, ok, jnp.max(jnp.where(saturated, jnp.abs(x), 0.0)), kernel)
-    return SignalPrior(kernel, innovation, excess, harmful)
+    return kernel, innovation, excess, harmful
 
 
 def hidden_peaks(
@@ -149,9 +149,13 @@ class Known(eqx.Module):
     """b."""
     covariance: Float[Array, "m m"]
     """Ω⁻¹."""
-    doubt: Float[Array, "m"]
-    """By what to multiply its sd: how far off hidden peaks were. The mode of δ does without that: it was no nearer to
-    the truth with it, and worse where short gaps were believed less."""
+    believed: Float[Array, "m m"]
+    """Covariance for what is said of fills: with how far off hidden peaks were. The mode of δ does without that: it
+    was no nearer to the truth with it, and worse where short gaps were believed less."""
+    expected: Float[Array, "m"]
+    """Mean of the sum of δ over the gap of each."""
+    alone: Float[Array, "m"]
+    """The same without what gaps of its kind lost."""
     variance: Float[Array, "m"]
     """Of each value about what it is set to.
 
@@ -208,18 +212,28 @@ def of_values(
     fill = jnp.where(real, jnp.maximum(mean, 0.0), 0.0)
     together = gap[:, None] == gap[None]
     covariance = within + jnp.where(together, SHARE**2 * fill[:, None] * fill[None], 0.0)
-    precision = inverse_positive(covariance)
     # What hidden peaks of about that length say.
-    place = jnp.clip(jnp.log2(jnp.maximum(length, 1.0)), 0.0, len(NODES) - 1.0)
-    nearness = jnp.maximum(1.0 - jnp.abs(place[:, None] - jnp.arange(float(len(NODES)))[None]), 0.0)
-    excess = jnp.where(real, jnp.sum(nearness * prior.excess[channel], axis=1), 1.0)
-    harmful = real & prior.harmful[channel, jnp.round(place).astype(int)]
-    variance = excess * jnp.diagonal(covariance) + jnp.where(harmful, mean**2, 0.0)
+    near = length_weights(length)
+    excess = jnp.where(real, jnp.sum(near * prior.excess[channel], axis=1), 1.0)
+    harmful = real & prior.harmful[channel, jnp.argmax(near, axis=1)]
+    doubt = jnp.sqrt(excess)
+    believed = covariance * doubt[:, None] * doubt[None]
+
+    # What gaps like them lost.
+    gaps = jnp.where(real[:, None], gap[:, None] == jnp.arange(len(gap))[None], False).astype(sign.dtype)
+    alone, some = gaps.T @ mean, jnp.argmax(gaps, axis=0)
+    usual = habit(prior.experience, channel[some], sign[some], jnp.sum(gaps, axis=0))
+    _, believed = with_habit(mean, believed, gaps, usual)
+    mean, covariance = with_habit(mean, covariance, gaps, usual)
+    precision = inverse_positive(covariance)
+    variance = jnp.diagonal(believed) + jnp.where(harmful, mean**2, 0.0)
     return Known(
         precision=precision,
         slope=-precision @ mean,
         covariance=covariance,
-        doubt=jnp.sqrt(excess),
+        believed=believed,
+        expected=(gaps.T @ mean)[gap],
+        alone=alone[gap],
         variance=jnp.where(real, variance, 0.0),
         harmful=harmful,
     )

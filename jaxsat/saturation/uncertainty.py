@@ -18,12 +18,15 @@ from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial.dense import eigh, solve_positive
 from jaxsat.saturation.arrival import own_misfit
+from jaxsat.saturation.experience import Heard
 from jaxsat.saturation.segment import Segment
 
 # As if in so many directions more as much had been left as expected: one motion alone says little about its scale.
 CREDIT = 3.0
 # Share of the prior's variance along a direction of δ that must be removed for it to count.
 LEAST_SEEN = 0.01
+# Share of the variance of what a gap lost that the rests must remove for others to learn from it.
+LEAST_HEARD = 0.5
 
 
 class Uncertainty(eqx.Module):
@@ -35,6 +38,10 @@ class Uncertainty(eqx.Module):
     """Of the sum of δ over the gap that the value lies in (its unit; times the period that is the impulse's)."""
     identified: Float[Array, "m"]
     """Share of the prior's variance of that sum which the rests removed: 0 where the prior alone decides."""
+    heard: Heard
+    """For the next search."""
+    asked: Float[Array, ""]
+    """By what the data ask for their variance to be scaled, be it less than one; NaN where no rest follows."""
     rank: Int[Array, ""]
     """In how many directions of δ the rests say anything, six at most and 0 where no rest follows: eigenvalues of the
     data's Hessian in the prior's metric above `LEAST_SEEN`."""
@@ -58,18 +65,6 @@ def uncertainty(
     known = segment.known
     assert known is not None, "the signal prior was gathered"
     A, one = jnp.stack(columns, axis=1), jnp.eye(len(columns))
-    # The centre of the Gaussian that was searched: where a limit holds δ, it lies beyond it.
-    seen = known.covariance @ A
-    strength = A.T @ seen
-    centre = delta - known.covariance @ slope + seen @ solve_positive(one + strength, seen.T @ slope)
-    free = jnp.trace(solve_positive(one + strength, one))
-
-    before = known.covariance * known.doubt[:, None] * known.doubt[None]
-    seen = before @ A
-    left = value - delta @ (known.slope + 0.5 * known.precision @ delta) - own_misfit(segment.arrival)
-    factor = jnp.maximum((2.0 * left + CREDIT) / (free + CREDIT), 1.0)
-    after = before - seen @ solve_positive(factor * one + A.T @ seen, seen.T)
-
     real = segment.bound > 0.0
     together = (segment.gap[:, None] == segment.gap[None]) & real[:, None] & real[None]
 
@@ -78,6 +73,32 @@ def uncertainty(
 
     def variance(covariance):
         return of_gap(jnp.sum(jnp.where(together, covariance, 0.0), axis=1))
+
+    # The centre of the Gaussian that was searched: where a limit holds δ, it lies beyond it.
+    seen = known.covariance @ A
+    strength = A.T @ seen
+    held = variance(known.covariance - seen @ solve_positive(one + strength, seen.T))
+    centre = delta - known.covariance @ slope + seen @ solve_positive(one + strength, seen.T @ slope)
+    free = jnp.trace(solve_positive(one + strength, one))
+
+    left = value - delta @ (known.slope + 0.5 * known.precision @ delta) - own_misfit(segment.arrival)
+    asked = (2.0 * left + CREDIT) / (free + CREDIT)
+    factor = jnp.maximum(asked, 1.0)
+    before = known.believed
+    seen = before @ A
+    after = before - seen @ solve_positive(factor * one + A.T @ seen, seen.T)
+
+    # The posterior of the sum is the product of two Gaussians: where the rests tell most of it, what they say is what
+    # the prior lacks.
+    wide = variance(known.covariance)
+    told = 1.0 - held / jnp.where(wide > 0.0, wide, 1.0)
+    clear = real & (told > LEAST_HEARD) & ~known.harmful
+    told = jnp.where(clear, told, 1.0)
+    heard = Heard(
+        sum=jnp.where(real, (of_gap(delta) - (1.0 - told) * known.expected) / told, 0.0),
+        variance=jnp.where(clear, factor * held / told, jnp.inf),
+        expected=jnp.where(real, known.alone, 0.0),
+    )
 
     gap_before = variance(before)
     share = 1.0 - variance(after) / jnp.where(gap_before > 0.0, gap_before, 1.0)
@@ -93,6 +114,8 @@ def uncertainty(
         sd=jnp.where(real, jnp.where(known.harmful, jnp.sqrt(known.variance), of_value), 0.0),
         gap_sd=jnp.where(real, of_sum, 0.0),
         identified=jnp.where(real, share, 0.0),
+        heard=heard,
+        asked=jnp.where(jnp.any(segment.arrival != 0.0), asked, jnp.nan),
         rank=jnp.sum(strengths > LEAST_SEEN),
         arrival=jnp.sqrt(jnp.maximum(removed, 0.0)),
     )

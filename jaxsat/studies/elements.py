@@ -25,6 +25,7 @@ from jaxsat.saturation.compensate import (
     signal_prior,
     solve_segments,
 )
+from jaxsat.saturation.experience import Heard, experienced
 from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
 from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
@@ -128,7 +129,7 @@ def run_elements(
         sizes,
         options,
         constants_sd(config),
-        config.saturation.sweeps,
+        tuple(config.saturation.passes(option.method) for option in options),
         jnp.asarray(config.smoother.relinearisations),
         standard,
     )
@@ -144,7 +145,7 @@ def _scores(
     sizes: Sizes,
     options,
     wanted,
-    sweeps: int,
+    sweeps: tuple[int, ...],
     relinearisations,
     standard: bool,
 ) -> Scores:
@@ -165,13 +166,13 @@ def score(
     sizes: Sizes,
     options: tuple[Options, ...],
     wanted: Float[Array, "9"] | None,
-    sweeps: int,
+    sweeps: tuple[int, ...],
     relinearisations: Int[Array, ""],
     standard: bool,
 ) -> Scores:
     """One trial clipped at one set of rails; every method on it.
 
-    wanted: prior sd of what is constant, as `Options.calibration_sd`.
+    sweeps: of each method; wanted: prior sd of what is constant, as `Options.calibration_sd`.
     """
     whole, count = case.trial, len(case.path)
     raw = whole.signal + case.offset[None]
@@ -212,11 +213,11 @@ def score(
         path = _smooth_path(trial, signal, trial.variance, first, relinearisations)
         found["standard"] = compared(path, signal)
     bare = None if wanted is not None or not options else _table(case, trial)
-    for option in options:
-        prior = signal_prior(trial) if option.method == "map" else None
+    for option, passes in zip(options, sweeps, strict=True):
+        first_prior = signal_prior(trial) if option.method == "map" else None
 
-        def once(before, _, option=option, prior=prior):
-            filled, extra, _, calibration = before
+        def once(before, _, option=option):
+            filled, extra, _, calibration, prior = before
             here = trial.calibrated(calibration)
             filtered = filter_trial(here, filled - calibration.constants[None, :6], extra)
             states, covariances, _ = jax.tree.map(lambda x: x[at], filtered)
@@ -229,11 +230,20 @@ def score(
             filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")
             extra, slack = (unfilled.at[place].set(x, mode="drop") for x in (fill.variance, fill.slack))
             calibration = _calibration(trial, filled, extra, wanted, 1, calibration)
-            return (filled, extra, slack, calibration), (fill, values)
+            if (found := fill.uncertainty) is not None:
+                # Of values that do not saturate nothing is heard.
+                nothing = Heard(
+                    jnp.zeros_like(signal), jnp.full_like(signal, jnp.inf), jnp.zeros_like(signal)
+                )
+                heard = jax.tree.map(lambda x, y: x.at[place].set(y, mode="drop"), nothing, found.heard)
+                asked = jnp.where(jnp.any(values.sample < count, axis=1), found.asked, jnp.nan)
+                taught = experienced(prior.experience, sign, heard, asked)
+                prior = eqx.tree_at(lambda p: p.experience, prior, taught)
+            return (filled, extra, slack, calibration, prior), (fill, values)
 
         # A loop, not a repetition: the program is compiled once.
-        begin = (signal, unfilled, unfilled, first)
-        (filled, _, slack, calibration), every = jax.lax.scan(once, begin, None, length=sweeps)
+        begin = (signal, unfilled, unfilled, first, first_prior)
+        (filled, _, slack, calibration, _), every = jax.lax.scan(once, begin, None, length=passes)
         fill, values = jax.tree.map(lambda x: x[-1], every)
         path = _smooth_path(trial, filled, trial.variance + slack, calibration, relinearisations)
         busy = jnp.any(values.sample < count, axis=1)
