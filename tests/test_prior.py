@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsat.saturation.experience import NODES, Experience
 from jaxsat.saturation.prior import (
     CREDIT,
     LEAST_LEVEL,
-    NODES,
     ORDER,
     SHARE,
     WIDTH,
@@ -107,7 +107,8 @@ OF_VALUES, FORM = jax.jit(of_values), jax.jit(quadratic_form)
 def prior() -> SignalPrior:
     kernel = np.stack([kernel_of(filter_of(PHI), variance) for variance in SIGMA**2])
     nodes = 6, len(NODES)
-    return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2), jnp.ones(nodes), jnp.zeros(nodes, bool))
+    nothing = jnp.ones(nodes), jnp.zeros(nodes, bool), Experience.none()
+    return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2), *nothing)
 
 
 def known(prior, signal=SHORT, sample=SAMPLE, channel=CHANNEL, sign=SIGN) -> Known:
@@ -253,7 +254,7 @@ def test_what_was_far_off_is_believed_less_but_filled_alike(prior):
     np.testing.assert_array_equal(doubted.slope, found.slope)
     sd = np.where((CHANNEL == 1) & (SIGN != 0), 2.0, 1.0)
     np.testing.assert_array_equal(doubted.covariance, found.covariance)
-    np.testing.assert_allclose(doubted.doubt, sd)
+    np.testing.assert_allclose(doubted.believed, np.outer(sd, sd) * found.covariance, atol=1e-12)
     np.testing.assert_allclose(doubted.variance, sd**2 * found.variance)
 
 

@@ -19,7 +19,7 @@ from jaxsat.present.tables import gaps_table, segments_table
 from jaxsat.saturation.arrival import own_misfit
 from jaxsat.saturation.prior import Known
 from jaxsat.saturation.segment import condense, value_and_root, value_gradient_root
-from jaxsat.saturation.uncertainty import CREDIT, LEAST_SEEN, truncated_deviation, uncertainty
+from jaxsat.saturation.uncertainty import CREDIT, LEAST_HEARD, LEAST_SEEN, truncated_deviation, uncertainty
 
 COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
 
@@ -42,8 +42,16 @@ def known_segment(scale: float):
     precision = np.eye(8)
     precision[:6, :6] = (root @ root.T + np.eye(6)) * scale
     covariance = jnp.asarray(np.linalg.inv(precision))
-    variance, harmful = jnp.diagonal(covariance), jnp.zeros(8, bool)
-    prior = Known(jnp.asarray(precision), jnp.zeros(8), covariance, jnp.ones(8), variance, harmful)
+    prior = Known(
+        precision=jnp.asarray(precision),
+        slope=jnp.zeros(8),
+        covariance=covariance,
+        believed=covariance,
+        expected=jnp.zeros(8),
+        alone=jnp.zeros(8),
+        variance=jnp.diagonal(covariance),
+        harmful=jnp.zeros(8, bool),
+    )
     segment = build(False)
     gaps = jnp.array([0, 0, 1, 2, 3, 4, 7, 7])
     return eqx.tree_at(lambda s: (s.known, s.gap), segment, (prior, gaps), is_leaf=lambda x: x is None)
@@ -111,6 +119,20 @@ def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
     assert found.rank == rank(segment)
 
 
+def test_what_the_rests_say_is_the_posterior_without_the_prior():
+    """Of the sum of a gap of which they say most; of one of which they say little nothing is passed on."""
+    expected = jnp.where(jnp.arange(8) < 2, 0.3, 0.0)
+    segment = eqx.tree_at(lambda s: s.known.expected, known_segment(1e-2), expected)
+    found = judge(segment, DELTA)
+    before, after, _, _ = dense(segment)
+    assert 1.0 - after / before > LEAST_HEARD
+    variance = 1.0 / (1.0 / after - 1.0 / before)
+    assert found.heard.variance[0] == pytest.approx(variance, rel=1e-6)
+    product = after * (0.3 / before + found.heard.sum[0] / variance)
+    assert product == pytest.approx(float(jnp.sum(DELTA[:2])), rel=1e-6)
+    assert np.isinf(judge(known_segment(1e6), DELTA).heard.variance).all()
+
+
 def test_data_that_leave_much_unexplained_are_believed_less():
     """Their variance is scaled by what is left at the mode, over the directions that δ does not take up."""
     segment = known_segment(1e-2)
@@ -145,7 +167,7 @@ def test_what_a_rest_costs_by_itself_is_the_least_over_all_arrivals():
 def test_hidden_peaks_that_were_far_off_widen_what_is_known():
     """A prior of twice the sd, as if δ had been its mode."""
     segment = known_segment(1.0)
-    doubted = eqx.tree_at(lambda s: s.known.doubt, segment, jnp.full(8, 2.0))
+    doubted = eqx.tree_at(lambda s: s.known.believed, segment, 4.0 * segment.known.covariance)
     slope, nothing = jnp.zeros(8), 6 * (jnp.zeros(8),)
     known, plain = (JUDGE(s, DELTA, jnp.zeros(()), slope, nothing, nothing) for s in (doubted, segment))
     covariance = np.asarray(segment.known.covariance)[:6, :6]

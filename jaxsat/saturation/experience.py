@@ -58,7 +58,7 @@ class Experience(eqx.Module):
 def length_weights(length: Float[Array, "*m"]) -> Float[Array, "*m L"]:
     """How near a length lies to each of `NODES`, in all one."""
     place = jnp.clip(jnp.log2(jnp.maximum(length, 1.0)), 0.0, len(NODES) - 1.0)
-    return jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(float(len(NODES)))), 0.0)
+    return jnp.maximum(1.0 - jnp.abs(jnp.subtract.outer(place, jnp.arange(float(len(NODES))))), 0.0)
 
 
 def experienced(
@@ -94,10 +94,10 @@ def experienced(
 
     weight = near / variance
     mean = over(total(weight * rate), total(weight))
-    excess = total(weight * (rate - mean) ** 2) - (total(near) - 1.0)
+    excess = total(weight * (rate - mean[None]) ** 2) - (total(near) - 1.0)
     spread = jnp.maximum(over(excess, total(weight) - over(total(weight**2), total(weight))), 0.0)
     spread = jnp.where(total(near) > 1.0, spread, 0.0)
-    weight = near / (spread + variance)
+    weight = near / (spread[None] + variance)
     asked = jnp.nanmedian(factor)
     return Experience(
         count=total(weight) * spread,
