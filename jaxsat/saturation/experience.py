@@ -39,11 +39,11 @@ class Experience(eqx.Module):
     """Of the gaps of each channel and direction, by length (`NODES`), rates being sums of δ over lengthᴾᴼᵂᴱᴿ."""
 
     count: Float[Array, "6 2 L"]
-    """How many there were, each as far as its rate is known better than rates differ."""
+    """How many there were, each as far as its rate is known better than to itself."""
     mean: Float[Array, "6 2 L"]
     """Mean rate."""
     spread: Float[Array, "6 2 L"]
-    """Variance of rates about it."""
+    """Variance of a further rate about it."""
     miss: Float[Array, "6 2 L"]
     """Mean square of the difference to the rate that the signal beside a gap made one expect."""
     noise: Float[Array, ""]
@@ -98,11 +98,12 @@ def experienced(
     spread = jnp.maximum(over(excess, total(weight) - over(total(weight**2), total(weight))), 0.0)
     spread = jnp.where(total(near) > 1.0, spread, 0.0)
     weight = near / (spread[None] + variance)
-    asked = jnp.nanmedian(factor)
+    mean, asked = over(total(weight * rate), total(weight)), jnp.nanmedian(factor)
+    square = mean[None] ** 2
     return Experience(
-        count=total(weight) * spread,
-        mean=over(total(weight * rate), total(weight)),
-        spread=spread,
+        count=total(near * over(square, square + variance)),
+        mean=mean,
+        spread=spread + over(jnp.sign(total(weight)), total(weight)),
         miss=jnp.maximum(over(total(weight * missed), total(weight)), 0.0),
         noise=jnp.maximum(before.noise * jnp.where(jnp.isnan(asked), 1.0, asked), 1.0),
     )
