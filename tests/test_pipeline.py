@@ -141,6 +141,27 @@ def test_map_leaves_at_most_a_tenth_of_the_error_on_the_bar():
     assert max(ratios) <= 0.1
 
 
+def rms(found: Estimate, true: np.ndarray) -> float:
+    return float(np.sqrt(np.sum((found.trajectory.position - true) ** 2, axis=1).mean()))
+
+
+@pytest.mark.slow
+def test_strides_without_a_rest_between_them_learn_from_the_others(shared_data):
+    """A PyShoe walk clipped in software, two strides of which trade what they lost."""
+    path = shared_data / "pyshoe" / "2017-11-22-11-48-35.mat"
+    if not path.is_file():
+        pytest.skip(f"the trial is not at {path}")
+    whole = read(path, rest_column="zv_shoe_opt")
+    rail = np.repeat([np.deg2rad(250.0), np.inf], 3)
+    clipped = whole.with_signal(np.clip(whole.signal, -rail, rail))
+    true = estimate(whole, load_config(None, method="standard")).trajectory.position
+    away = [
+        rms(estimate(clipped, load_config(None, method="map", **{"saturation.sweeps": sweeps})), true)
+        for sweeps in (1, "auto")
+    ]
+    assert away[1] < 0.5 * away[0]
+
+
 @pytest.mark.slow
 def test_map_on_a_recording_that_truly_saturated(shared_data):
     """A PyShoe trial, scored by Vicon. Slow: a minute of samples is compiled for its own sizes."""

@@ -41,7 +41,8 @@ class Uncertainty(eqx.Module):
     heard: Heard
     """For the next search."""
     asked: Float[Array, ""]
-    """By what the data ask for their variance to be scaled, be it less than one; NaN where no rest follows."""
+    """By what the data ask for their variance to be scaled, be it less than one; NaN where no rest follows, a
+    bound holds δ or a gap is not to be filled."""
     rank: Int[Array, ""]
     """In how many directions of δ the rests say anything, six at most and 0 where no rest follows: eigenvalues of the
     data's Hessian in the prior's metric above `LEAST_SEEN`."""
@@ -84,6 +85,8 @@ def uncertainty(
     left = value - delta @ (known.slope + 0.5 * known.precision @ delta) - own_misfit(segment.arrival)
     asked = (2.0 * left + CREDIT) / (free + CREDIT)
     factor = jnp.maximum(asked, 1.0)
+    # What δ is kept from explaining is no noise.
+    kept = jnp.any(real & ((delta >= segment.bound * (1.0 - 1e-9)) | known.harmful))
     before = known.believed
     seen = before @ A
     after = before - seen @ solve_positive(factor * one + A.T @ seen, seen.T)
@@ -115,7 +118,7 @@ def uncertainty(
         gap_sd=jnp.where(real, of_sum, 0.0),
         identified=jnp.where(real, share, 0.0),
         heard=heard,
-        asked=jnp.where(jnp.any(segment.arrival != 0.0), asked, jnp.nan),
+        asked=jnp.where(jnp.any(segment.arrival != 0.0) & ~kept, asked, jnp.nan),
         rank=jnp.sum(strengths > LEAST_SEEN),
         arrival=jnp.sqrt(jnp.maximum(removed, 0.0)),
     )
