@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
-from jaxsat.pipeline import estimate
+from jaxsat.pipeline import Estimate, estimate
 from jaxsat.preparation import LATEST_FIRST_REST
 from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table
