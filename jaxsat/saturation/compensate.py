@@ -67,7 +67,7 @@ class Fills(eqx.Module):
     """Values that `map` left as they are but for their noise (`SegmentFill.inflated`)."""
     status: Int[np.ndarray, "S"]
     cost_before: Float[np.ndarray, "S"]
-    """f(0), with the departure of the last sweep."""
+    """f(0), with the departure of the last sweep; by `map` with the noise of `Experience`, like `cost_after`."""
     cost_after: Float[np.ndarray, "S"]
     residual: Float[np.ndarray, "S"]
     iterations: Int[np.ndarray, "S"]
