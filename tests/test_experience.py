@@ -57,15 +57,23 @@ def test_mean_and_spread_are_those_of_random_effects(sample):
     spread = excess / (weight.sum() - weight @ weight / weight.sum())
     weight = 1.0 / (spread + sd**2)
     at = CHANNEL, 0, NODE
-    assert found.spread[at] == pytest.approx(spread, rel=1e-8)
-    assert found.mean[at] == pytest.approx(weight @ rates / weight.sum(), rel=1e-8)
-    assert found.count[at] == pytest.approx(weight.sum() * spread, rel=1e-8)
+    mean = weight @ rates / weight.sum()
+    assert found.spread[at] == pytest.approx(spread + 1.0 / weight.sum(), rel=1e-8)
+    assert found.mean[at] == pytest.approx(mean, rel=1e-8)
+    assert found.count[at] == pytest.approx(np.sum(mean**2 / (mean**2 + sd**2)), rel=1e-8)
     missed = weight @ ((rates - 0.5) ** 2 - sd**2) / weight.sum()
     assert found.miss[at] == pytest.approx(missed, rel=1e-8)
     # Of what made them, too; and nothing of any other kind.
     assert found.mean[at] == pytest.approx(2.0, abs=0.15) and np.sqrt(spread) == pytest.approx(0.3, abs=0.1)
-    assert 10 < found.count[at] < 45
+    assert 40 < found.count[at] < 46
     assert np.count_nonzero(found.count) == np.count_nonzero(found.mean) == 1
+
+
+def test_gaps_that_lose_alike_say_so():
+    """Their differences are within what is heard of each: no spread, and a further one is known like their mean."""
+    found = learn(*gaps_of([2.0, 2.01, 1.99, 2.0], [0.1] * 4))
+    assert found.spread[CHANNEL, 0, NODE] == pytest.approx(0.1**2 / 4)
+    assert found.count[CHANNEL, 0, NODE] == pytest.approx(4.0, abs=0.02)
 
 
 def test_gaps_of_which_nothing_is_heard_teach_nothing(sample):
