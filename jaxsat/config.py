@@ -272,4 +272,6 @@ def _sentence(error: ValidationError) -> str:
         key=len,
         default="",
     )
-    return f"'{key}' is {first['input']!r}, but {first['msg'][0].lower()}{first['msg'][1:]}."
+    said = [e["msg"] for e in error.errors() if ".".join(map(str, e["loc"])).startswith(key)]
+    rest = [message.removeprefix("Input should be ") for message in said[1:]]
+    return f"'{key}' is {first['input']!r}, but {' or '.join([said[0][0].lower() + said[0][1:], *rest])}."

@@ -289,3 +289,12 @@ def test_the_demo_compensates_most_of_the_error(tmp_path, capsys):
     assert unclipped < 0.2 and after < 0.1 * before
     report = Path(lines[-1].removeprefix("report: "))
     assert "motion capture" in report.read_text() and (tmp_path / "demo" / "walk_300dps.parquet").is_file()
+
+
+def test_a_value_of_two_kinds_is_told_both(tmp_path):
+    path = tmp_path / "sweeps.toml"
+    path.write_text("[saturation]\nsweeps = 0\n")
+    with pytest.raises(
+        InputError, match="'saturation.sweeps' is 0, but input should be 'auto' or greater than or equal to 1"
+    ):
+        load_config(path)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial.dense import solve_positive
+from jaxsat.saturation.gap_shapes import gap_ends
 
 # Lengths (samples) by which gaps are compared; each twice the last.
 NODES = (1, 2, 4, 8, 16, 32, 64)
@@ -70,9 +71,7 @@ def experienced(
     was searched. Rates are random effects: what their differences exceed their own variances is their spread
     (DerSimonian and Laird 1986, Controlled Clinical Trials 7).
     """
-    steps, still = jnp.arange(len(sign))[:, None], jnp.zeros_like(sign[:1])
-    begins = (sign != 0) & (sign != jnp.concatenate([still, sign[:-1]]))
-    ends = (sign != 0) & (sign != jnp.concatenate([sign[1:], still]))
+    steps, (begins, ends) = jnp.arange(len(sign))[:, None], gap_ends(sign)
     last = jax.lax.cummin(jnp.where(ends, steps, len(sign)), reverse=True)
     length = jnp.where(begins, last - steps + 1, 1).astype(heard.sum.dtype)
     sound = begins & (heard.variance > 0.0) & jnp.isfinite(heard.variance)

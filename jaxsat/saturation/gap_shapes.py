@@ -10,9 +10,17 @@ from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 Shape = Literal["triangle", "quadratic"]
+
+
+def gap_ends(sign: Int[Array, "N 6"]) -> tuple[Bool[Array, "N 6"], Bool[Array, "N 6"]]:
+    """Of the values that saturate, the first and the last of each gap: of neighbours that do so in one direction."""
+    still = jnp.zeros_like(sign[:1])
+    begins = (sign != 0) & (sign != jnp.concatenate([still, sign[:-1]]))
+    ends = (sign != 0) & (sign != jnp.concatenate([sign[1:], still]))
+    return begins, ends
 
 
 class Edges(eqx.Module):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.saturation.gap_shapes import Edges, edge_slope
+from jaxsat.saturation.gap_shapes import Edges, edge_slope, gap_ends
 from jaxsat.saturation.prior import SignalPrior, of_values
 from jaxsat.saturation.segment import Segment
 from jaxsat.signals.rests import Segments
@@ -180,9 +180,7 @@ def _gaps(trial: Trial, signal, sign, start, sample, channel, valid, size: int):
     measured, lie inside the recording and do not saturate themselves, and where the gap has two samples.
     """
     n, count = len(signal), len(trial.signal)
-    still = jnp.zeros_like(sign[:1])
-    begins = (sign != 0) & (sign != jnp.concatenate([still, sign[:-1]]))
-    ends = (sign != 0) & (sign != jnp.concatenate([sign[1:], still]))
+    begins, ends = gap_ends(sign)
     # Channel after channel, so that the i-th beginning and the i-th end are those of the same gap.
     number = jnp.cumsum(begins.T.reshape(-1)).reshape(6, n) - 1
     (first,) = jnp.nonzero(begins.T.reshape(-1), size=size, fill_value=6 * n)
