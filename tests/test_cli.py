@@ -13,6 +13,8 @@ import pytest
 from corruptions import CORRUPTIONS
 
 from jaxsat.cli import main
+from jaxsat.config import load_config
+from jaxsat.errors import InputError
 
 FILES = {
     "trajectory.parquet",
@@ -294,7 +296,5 @@ def test_the_demo_compensates_most_of_the_error(tmp_path, capsys):
 def test_a_value_of_two_kinds_is_told_both(tmp_path):
     path = tmp_path / "sweeps.toml"
     path.write_text("[saturation]\nsweeps = 0\n")
-    with pytest.raises(
-        InputError, match="'saturation.sweeps' is 0, but input should be 'auto' or greater than or equal to 1"
-    ):
+    with pytest.raises(InputError, match=r"is 0, but input should be 'auto' or greater than or equal to 1\."):
         load_config(path)
