@@ -25,8 +25,9 @@ RAILS = (RAIL, np.inf)
 
 
 def settings(gyr_rail="none") -> Config:
+    """Searches run so far that programs of other shapes end alike."""
     return Config.model_validate(
-        {"rails": {"gyr": gyr_rail, "acc": "none"}, "saturation": {"gyr_bound": 5.0}}
+        {"rails": {"gyr": gyr_rail, "acc": "none"}, "saturation": {"gyr_bound": 5.0, "tolerance": 1e-5}}
     )
 
 
@@ -151,9 +152,8 @@ def test_neither_memory_nor_devices_change_a_number(table, trials):
     assert DEVICES == 1 or not places[0].is_fully_replicated
     assert steps == [("sweep", done, 6) for done in range(DEVICES, 7, DEVICES)]
     # Programs of other shapes round otherwise; what no rest sees of a filled value is rounding over damping.
-    rounded = ["fill_rmse_gyr", "residual"]
-    np.testing.assert_allclose(chunked[rounded], table[rounded], atol=1e-8)
-    chunked, expected = (t.drop(columns=rounded) for t in (chunked, table))
+    np.testing.assert_allclose(chunked["fill_rmse_gyr"], table["fill_rmse_gyr"], atol=1e-8)
+    chunked, expected = (t.drop(columns="fill_rmse_gyr") for t in (chunked, table))
     pd.testing.assert_frame_equal(chunked, expected, rtol=1e-9, atol=1e-9)
 
 
