@@ -21,7 +21,7 @@ from jaxsat.inertial.orientation import (
     orientation,
     start_at_rest,
 )
-from jaxsat.inertial.programs import compiled, make_room
+from jaxsat.inertial.programs import compiled, computing, make_room
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.preparation import LEFT_OFFSET_SD, MOVING_START_SD, MOVING_START_TILT_SD, given_gains
 from jaxsat.saturation.interpolation import interpolate_gaps
@@ -85,7 +85,7 @@ def orient(recording: Recording, config: Config | None = None) -> Orientation:
     saturated, sign = saturation_mask(recording, rails)
     first = _first_rest(recording)
     make_room()
-    with jax.enable_x64(True):
+    with computing():
         start = start_at_rest(jnp.asarray(recording.signal[:first]))
         moving = first < round(FIRST / period)
         if moving:

@@ -15,7 +15,7 @@ from jaxsat.errors import InputError
 from jaxsat.inertial.filters import Filter, butterworth
 from jaxsat.inertial.harmonic import Spectrum, learn, least_squares, predict, recursive
 from jaxsat.inertial.periodic import bmflc, chain_response, integrated, references, wflc
-from jaxsat.inertial.programs import make_room
+from jaxsat.inertial.programs import computing, make_room
 from jaxsat.inertial.windows import Windows, neighbours, periodogram
 from jaxsat.saturation.harmonic_fill import fill_harmonic
 from jaxsat.signals.checks import check_form, check_wraps
@@ -75,7 +75,7 @@ def estimate_periodic(recording: Recording, config: Config | None = None) -> Per
     """
     config = config or Config()
     make_room()
-    with jax.enable_x64(True):
+    with computing():
         return _estimate(recording, config)
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import cast
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
 from jaxsat.inertial.calibration import Calibration
-from jaxsat.inertial.programs import stored_jit
+from jaxsat.inertial.programs import computing, stored_jit
 from jaxsat.inertial.smoother import (
     ActiveSet,
     Smoothed,
@@ -100,7 +101,7 @@ def estimate(
     trajectory: no gyroscope, no rest at all, units that cannot be.
     """
     config = config or Config()
-    with jax.enable_x64(True):
+    with computing():
         return _estimate(recording, config, progress or (lambda *_: None))
 
 
@@ -125,10 +126,10 @@ def constants_sd(config: Config) -> Float[Array, "9"] | None:
 
 def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
     """The constants that the rests of a recording tell; what saturates may be anything within its bounds."""
-    sd, none = constants_sd(config), Calibration.none()
-    if sd is None:
-        return none
-    return calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, FIRST_STEPS, none)
+    sd, found = constants_sd(config), Calibration.none()
+    for _ in range(FIRST_STEPS if sd is not None else 0):
+        found = calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, found)
+    return found
 
 
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
@@ -139,30 +140,36 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     fills = Fills.nothing(trial, len(segments))
     searched = without_floor(trial, config)
     calibration = calibrate_by_rests(searched, config)
+    clock.lap("calibration")
     sure = trial.calibrated(calibration)
-    standard, floor = _smooth(sure, config)
-    smoothed = standard
-    clock.lap("smoother")
-    if config.method != "standard" and len(gaps):
-        options = search_options(config, config.method)
-        report = partial(progress, "segments")
-        given = searched, segments, options, calibration
-        if config.saturation.segments == "parallel":
-            fills, calibration = compensate_parallel(*given, config.saturation.passes(config.method), report)
-        else:
-            fills, calibration = compensate_sequential(*given, report)
-        clock.lap("compensation")
-        filled = eqx.tree_at(lambda t: t.signal, trial, fills.signal).calibrated(calibration)
-        path, sure = (
-            eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
-            for extra in (fills.slack, fills.variance)
-        )
-        smoothed, floor = _smooth(path, config)
-        if (fills.slack != fills.variance).any():
+    # What the search does not wait for goes on beside it.
+    with ThreadPoolExecutor(1) as beside:
+        ignoring = beside.submit(_smooth, sure, config)
+        compensated = None
+        if config.method != "standard" and len(gaps):
+            options = search_options(config, config.method)
+            report = partial(progress, "segments")
+            given = searched, segments, options, calibration
+            if config.saturation.segments == "parallel":
+                passes = config.saturation.passes(config.method)
+                fills, calibration = compensate_parallel(*given, passes, report)
+            else:
+                fills, calibration = compensate_sequential(*given, report)
+            clock.lap("compensation")
+            filled = eqx.tree_at(lambda t: t.signal, trial, fills.signal).calibrated(calibration)
+            path, sure = (
+                eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
+                for extra in (fills.slack, fills.variance)
+            )
             # How sure the path is, is another question.
-            covariance = _smooth(sure, config)[0].covariance
-            smoothed = eqx.tree_at(lambda s: s.covariance, smoothed, covariance)
-        clock.lap("smoother")
+            doubted = beside.submit(_smooth, sure, config) if (fills.slack != fills.variance).any() else None
+            compensated = _smooth(path, config)
+            if doubted is not None:
+                covariance = doubted.result()[0].covariance
+                compensated = eqx.tree_at(lambda s: s[0].covariance, compensated, covariance)
+        standard, floor = ignoring.result()
+        smoothed, floor = compensated or (standard, floor)
+    clock.lap("smoother")
 
     n = len(recording)
 
@@ -225,7 +232,7 @@ def displacements(found: Estimate) -> tuple[Float[np.ndarray, "S 3"], Float[np.n
         departure, arrival = np.pad(ends, ((0, 0), (0, bucket(count, 16) - count)), mode="edge")
         known = found.trajectory
         states = (pad(x, size) for x in (known.q_nb, known.velocity, position, known.covariance))
-        with jax.enable_x64(True):
+        with computing():
             ways = _ways(problem, tuple(states), departure, arrival)
         covariance[whole] = np.asarray(ways)[:count]
     return way, covariance
@@ -255,18 +262,20 @@ class _Clock:
 
 
 def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:
-    smoothed, floor = _whole_trial(
-        trial.signal,
-        trial.period,
-        trial.variance,
-        trial.rows,
-        trial.prior,
-        trial.prior_covariance,
-        trial.gravity,
-        np.asarray(config.smoother.relinearisations),
-        config.height.mode == "nonnegative",
-    )
-    return jax.block_until_ready(smoothed), floor
+    # JAX's precision is a thread's own setting.
+    with computing():
+        smoothed, floor = _whole_trial(
+            trial.signal,
+            trial.period,
+            trial.variance,
+            trial.rows,
+            trial.prior,
+            trial.prior_covariance,
+            trial.gravity,
+            np.asarray(config.smoother.relinearisations),
+            config.height.mode == "nonnegative",
+        )
+        return jax.block_until_ready(smoothed), floor
 
 
 @stored_jit

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsat.config import Config
 from jaxsat.errors import InputError
 from jaxsat.inertial.orientation import Gains, Start, backward
-from jaxsat.inertial.programs import make_room, stored_jit
+from jaxsat.inertial.programs import computing, make_room, stored_jit
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
@@ -49,7 +49,7 @@ class Prepared(eqx.Module):
 
 def prepare(recording: Recording, config: Config) -> Prepared:
     """All that is done to a recording before it is smoothed; raises `InputError` as `estimate` does."""
-    with jax.enable_x64(True):
+    with computing():
         return _prepare(recording, config)
 
 

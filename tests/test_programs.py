@@ -1,5 +1,6 @@
 """Traces that are kept: the same results without running the Python code again, and never a wrong one."""
 
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -7,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import NamedSharding, PartitionSpec
+from threadpoolctl import threadpool_info
 
 from jaxsat.inertial import programs
-from jaxsat.inertial.programs import keep_traces, stored_jit
+from jaxsat.inertial.programs import computing, keep_traces, stored_jit
 
 TRACED = []
 
@@ -115,6 +118,44 @@ def test_inside_another_program_it_is_the_function(folder):
     found = jax.vmap(lambda value: run(Pair(value, "a"), jnp.asarray(2.0), 3)[1]["sum"])(jnp.ones((4, 3)))
     np.testing.assert_allclose(found, 3.0)
     assert not folder.exists()
+
+
+def test_what_runs_within_another_program_has_a_trace_too(folder):
+    """Spread over devices, each of which runs it; its own process traces it once, later ones do not."""
+    assert jax.local_device_count() > 1, "spread over one device it is not spread"
+    mesh = jax.make_mesh((jax.local_device_count(),), ("devices",), devices=jax.local_devices())
+    spread = PartitionSpec("devices")
+    values = jnp.arange(6.0 * jax.local_device_count()).reshape(-1, 3)
+
+    def each(values, factor):
+        TRACED.append(values.shape)
+        return jax.vmap(lambda x: jnp.linalg.cholesky(jnp.eye(3) + jnp.outer(x, x))[:, 0] * factor)(values)
+
+    def spread_over_devices(inner):
+        def outer(values, factor):
+            local = partial(lambda x, factor: inner(x, factor), factor=factor)
+            return jax.shard_map(local, mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False)(values)
+
+        return jax.jit(outer)(jax.device_put(values, NamedSharding(mesh, spread)), 2.0)
+
+    expected = [np.linalg.cholesky(np.eye(3) + np.outer(x, x))[:, 0] * 2.0 for x in np.asarray(values)]
+    for _ in range(3):
+        programs._loaded.clear()
+        np.testing.assert_allclose(spread_over_devices(stored_jit(each, None)), expected)
+    assert TRACED == [(2, 3)] and len(list(folder.iterdir())) == 1
+
+
+def test_lapack_has_one_thread_and_jax_double_precision_while_something_is_computed():
+    def state():
+        blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+        return blas, bool(jax.config.jax_enable_x64)  # type: ignore[attr-defined]
+
+    with jax.enable_x64(False):
+        before = state()
+        with computing(), computing():
+            inside = state()
+        assert inside == ([1] * len(before[0]), True) and before[0]
+        assert state() == before
 
 
 def test_a_process_does_not_die_of_the_programs_that_it_has_compiled(monkeypatch):

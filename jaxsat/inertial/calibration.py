@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsat.inertial import kalman
 from jaxsat.inertial.dense import inverse_positive
@@ -107,24 +107,19 @@ def calibrate(
     prior_covariance: Float[Array, "p p"],
     gravity: Float[Array, ""],
     sd: Float[Array, "9"],
-    steps: Int[Array, ""] | int,
     start: Calibration,
 ) -> Calibration:
-    """The constants with a zero-mean prior, by Gauss-Newton steps from `start`.
+    """The constants with a zero-mean prior, by one Gauss-Newton step from `start`.
 
     sd: prior standard deviation of each (rad/s, m/s², m); zero where it is not wanted.
     """
     # One that is not wanted is as good as known.
     scale = jnp.maximum(sd, 1e-12)
-
-    def step(_, now: Calibration) -> Calibration:
-        quadratic = constants_quadratic(*now.applied(samples, rows), prior, prior_covariance, gravity)
-        # In units of the prior, where the Hessian is at least the identity.
-        hessian = jnp.eye(CONSTANTS) + quadratic[1:, 1:] * scale[:, None] * scale[None]
-        gradient = now.constants / scale + quadratic[1:, 0] * scale
-        covariance = inverse_positive(hessian)
-        constants = now.constants - scale * (covariance @ gradient)
-        found = scale * jnp.sqrt(jnp.diagonal(covariance))
-        return Calibration(jnp.where(sd > 0.0, constants, 0.0), jnp.where(sd > 0.0, found, 0.0))
-
-    return jax.lax.fori_loop(0, steps, step, start)
+    quadratic = constants_quadratic(*start.applied(samples, rows), prior, prior_covariance, gravity)
+    # In units of the prior, where the Hessian is at least the identity.
+    hessian = jnp.eye(CONSTANTS) + quadratic[1:, 1:] * scale[:, None] * scale[None]
+    gradient = start.constants / scale + quadratic[1:, 0] * scale
+    covariance = inverse_positive(hessian)
+    constants = start.constants - scale * (covariance @ gradient)
+    found = scale * jnp.sqrt(jnp.diagonal(covariance))
+    return Calibration(jnp.where(sd > 0.0, constants, 0.0), jnp.where(sd > 0.0, found, 0.0))

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxsat.errors import InputError
 from jaxsat.inertial.orientation import Gains, Start, orientation, start_at_rest, up_in_body
+from jaxsat.inertial.programs import computing
 from jaxsat.inertial.rotations import quat_conjugate, quat_exp, quat_multiply, quat_rotate
 
 STEP = np.deg2rad(10.0)
@@ -32,7 +33,7 @@ def good_gain(rest: Float[np.ndarray, "n 6"], period: float, tau: float = 0.0) -
     # A damped swing of a loop with a low-pass takes about 4π τ to show both.
     n = int(np.ceil(16.0 * tau / period)) + 100
     kp = np.geomspace(0.02 if tau else 0.1 / period, 3.9 / period, _LADDER)
-    with jax.enable_x64(True):
+    with computing():
         signal = jnp.asarray(np.resize(rest, (n, 6)))
         start = start_at_rest(jnp.asarray(rest))
         response = np.asarray(

@@ -1,14 +1,16 @@
-"""Compiled functions: with what options, whose traces outlive the process, and which do not crowd it.
+"""Compiled functions: their options and precision, whose traces outlive the process, and which do not crowd it.
 
 JAX keeps compiled programs on disk, but to know which one it needs it traces the Python code anew in each process:
 most of what a later run of the command line would wait for. `stored_jit` keeps the traces too.
 """
 
 import hashlib
+import os
 import pickle
 import platform
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +20,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
+from threadpoolctl import threadpool_limits
 
 F = TypeVar("F", bound=Callable[..., Any])
 Options = dict[str, Any]
@@ -35,6 +38,22 @@ MOST_MAPS = 0.5
 
 _folder: Path | None = None
 _loaded: dict[str, Callable[..., Any] | None] = {}
+
+
+@contextmanager
+def computing() -> Iterator[None]:
+    """In here JAX computes in double precision, whatever its setting, and LAPACK in one thread.
+
+    Matrices of these problems are small: several threads gain nothing, and where another process wants the cores too
+    they wait for each other twenty times as long as they compute.
+    """
+    with threadpool_limits(1, "blas"), jax.enable_x64(True):
+        yield
+
+
+def usable_cores() -> int:
+    """That this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def compiled(function: F, options: Options = OPTIONS) -> F:
@@ -65,20 +84,23 @@ def make_room() -> None:
         jax.clear_caches()
 
 
-def stored_jit(function: F, options: Options = OPTIONS) -> F:
+def stored_jit(function: F, options: Options | None = OPTIONS) -> F:
     """`compiled` of a function of positional arguments that returns arrays; its trace is kept.
+
+    options: None for one that is called by functions that are traced themselves, which then cannot be transformed.
 
     A trace is for the code of the package, the versions of what it runs on, the kind of device, and the arguments'
     shapes, types and whatever is no array. One that cannot be read is made anew; where none can be made or written it
     goes without.
     """
-    jitted = compiled(function, options)
+    inner = options is None
+    jitted = function if inner else compiled(function, options)
 
     @wraps(function)
     def call(*args):
         arrays, rest = eqx.partition(args, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic))
         leaves, structure = jax.tree.flatten(arrays)
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
+        if not inner and any(isinstance(leaf, Tracer) for leaf in leaves):
             return function(*args)
         if _folder is None:
             return jitted(*args)
@@ -110,13 +132,14 @@ def _surroundings() -> str:
     return " ".join([code.hexdigest(), platform.python_version(), jax.default_backend(), *versions])
 
 
-def _program(exported: Any, skeleton: Any, options: Options) -> Callable[..., Any]:
+def _program(exported: Any, skeleton: Any, options: Options | None) -> Callable[..., Any]:
     """A callable of a trace: of the leaves of its arguments, returning the tree that the function does."""
-    run, structure = jax.jit(exported.call, compiler_options=options), jax.tree.structure(skeleton)
+    run = exported.call if options is None else jax.jit(exported.call, compiler_options=options)
+    structure = jax.tree.structure(skeleton)
     return lambda *leaves: jax.tree.unflatten(structure, run(*leaves))
 
 
-def _read(path: Path, options: Options) -> Callable[..., Any] | None:
+def _read(path: Path, options: Options | None) -> Callable[..., Any] | None:
     from jax import export
 
     try:
@@ -128,7 +151,7 @@ def _read(path: Path, options: Options) -> Callable[..., Any] | None:
 
 
 def _trace(
-    function: Callable[..., Any], kinds: list[Any], path: Path, options: Options
+    function: Callable[..., Any], kinds: list[Any], path: Path, options: Options | None
 ) -> Callable[..., Any] | None:
     from jax import export
 

@@ -170,16 +170,15 @@ def calibrate_trial(
     signal: Float[Arrays, "N 6"],
     extra: Float[Arrays, "N 6"],
     sd: Float[Arrays, "9"],
-    steps: Int[Arrays, ""] | int,
     start: Calibration,
 ) -> Calibration:
-    """The constants of a recording by some steps from `start`, given a filled signal; `extra` as above.
+    """The constants of a recording by one step from `start`, given a filled signal; `extra` as above.
 
     sd: prior sd of each.
     """
     samples = Samples(signal, trial.period, trial.variance + extra)
     known = trial.rows, trial.prior, trial.prior_covariance, trial.gravity
-    return calibrate(samples, *known, sd, steps, start)
+    return calibrate(samples, *known, sd, start)
 
 
 calibrate_recording = stored_jit(calibrate_trial)
@@ -262,7 +261,7 @@ def recalibrated(trial: Trial, fills: Fills, options: Options, calibration: Cali
     """The calibration that goes with a filled signal, from the one before."""
     if options.calibration_sd is None:
         return calibration
-    return calibrate_recording(trial, fills.signal, fills.variance, options.calibration_sd, 1, calibration)
+    return calibrate_recording(trial, fills.signal, fills.variance, options.calibration_sd, calibration)
 
 
 def _chunks(

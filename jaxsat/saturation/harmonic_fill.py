@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.errors import InputError
 from jaxsat.inertial.harmonic import Spectrum
+from jaxsat.inertial.programs import computing
 from jaxsat.inertial.windows import Windows, harmonics, neighbours, periodogram
 
 SAMPLES = 256
@@ -63,7 +64,7 @@ def fill_harmonic(
         )
     if measured.all():
         return HarmonicFill(signal.copy(), np.zeros(len(signal)))
-    with jax.enable_x64(True):
+    with computing():
         return _fill(signal, sign, measured)
 
 

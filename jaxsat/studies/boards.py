@@ -18,6 +18,7 @@ from typing import Any, Literal
 import jax
 
 from jaxsat.errors import InputError
+from jaxsat.inertial.programs import usable_cores
 
 Direction = Literal["lower", "higher"]
 """Which values are better."""
@@ -114,7 +115,7 @@ def machine() -> dict[str, Any]:
     devices = jax.devices()
     return {
         "cpu": _cpu_model(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "device": devices[0].device_kind,
         "devices": len(devices),
         "python": platform.python_version(),

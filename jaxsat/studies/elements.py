@@ -3,6 +3,8 @@
 `score` works on one element; `run_elements` is the one place where `vmap` runs over many of them.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
 from jaxsat.inertial.calibration import Calibration
-from jaxsat.inertial.programs import compiled
+from jaxsat.inertial.programs import compiled, stored_jit
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import constants_sd
@@ -137,26 +139,21 @@ def run_elements(
 
 
 @compiled
-def _scores(
-    cases: Case,
-    rails,
-    bounds,
-    mesh: Mesh,
-    sizes: Sizes,
-    options,
-    wanted,
-    sweeps: tuple[int, ...],
-    relinearisations,
-    standard: bool,
-) -> Scores:
-    def one(case, rail, bound):
-        return score(case, rail, bound, sizes, options, wanted, sweeps, relinearisations, standard)
-
+def _scores(cases: Case, rails, bounds, mesh: Mesh, *settings) -> Scores:
     # Devices run on their own: a search that is done in one need not wait for another's.
     spread = PartitionSpec("elements")
-    return jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False)(
-        cases, rails, bounds
-    )
+    return jax.shard_map(
+        lambda *elements: _scores_of_device(*elements, *settings),
+        mesh=mesh,
+        in_specs=spread,
+        out_specs=spread,
+        check_vma=False,
+    )(cases, rails, bounds)
+
+
+@partial(stored_jit, options=None)
+def _scores_of_device(cases: Case, rails, bounds, *settings) -> Scores:
+    return jax.vmap(lambda case, rail, bound: score(case, rail, bound, *settings))(cases, rails, bounds)
 
 
 def score(
@@ -266,7 +263,13 @@ def _calibration(
     trial: Trial, signal, extra, wanted, steps: int = FIRST_STEPS, start: Calibration | None = None
 ) -> Calibration:
     start = Calibration.none() if start is None else start
-    return start if wanted is None else calibrate_trial(trial, signal, extra, wanted, steps, start)
+    if wanted is None:
+        return start
+
+    def step(_, found: Calibration) -> Calibration:
+        return calibrate_trial(trial, signal, extra, wanted, found)
+
+    return jax.lax.fori_loop(0, steps, step, start)
 
 
 def _table(case: Case, trial: Trial) -> Float[Array, "S 10 10"]:

@@ -14,6 +14,7 @@ import pandas as pd
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxsat.errors import InputError
+from jaxsat.inertial.programs import computing
 from jaxsat.inertial.rotations import quat_conjugate, quat_multiply, quat_rotate
 from jaxsat.signals.recording import CHANNELS, Recording
 from jaxsat.studies.boards import write_whole
@@ -104,7 +105,7 @@ def simulate(
         raise InputError(f"simulate: {duration} s at {rate} Hz hold no two samples; raise rate or duration.")
     index = np.arange(round(duration * rate))
     time, middle = index / rate, (index + 0.5) / rate
-    with jax.enable_x64(True):
+    with computing():
         # Parameters as arrays: another value of one does not compile anew.
         parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), motion)
         chunks = [_sample(parameters, *times) for times in zip(_chunked(time), _chunked(middle), strict=True)]

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
-from jaxsat.inertial.programs import make_room
+from jaxsat.inertial.programs import computing, make_room
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
@@ -58,8 +58,8 @@ def sweep(
     recordings: each with a name of its own; or names and a function for each that loads it when its turn comes.
     Rests are those of the recording as given, and so is the path that is compared with. gyr_rails, acc_rails:
     limits in rad/s and m/s²; infinite leaves a sensor as it is. gyr_bounds, acc_bounds: values of δ_b (default:
-    those of the configuration). memory: what the arrays of a call may take (bytes), on
-    each of the local devices; one element always runs.
+    those of the configuration). memory: what the arrays of a call may take (bytes), on each of the local devices or,
+    where these are parts of one CPU, in all; one element of each device always runs.
 
     Returns one row an element and method: `trial` (the name of the recording), `method`, the rails and bounds,
     `saturated` (values), `segments` (that saturate), `status` (that of the worst segment), `cost_before`,
@@ -71,7 +71,7 @@ def sweep(
     """
     plan = _plan(config or Config(), methods, gyr_rails, acc_rails, gyr_bounds, acc_bounds, memory)
     loaders = _loaders(recordings)
-    with jax.enable_x64(True):
+    with computing():
         # Called in here: the tolerances among them are arrays of double precision.
         options = tuple(
             search_options(plan.config, method) for method in plan.methods if method != "standard"
@@ -217,14 +217,15 @@ def _chunks(
 ) -> Iterator[tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C 4"], int]]:
     """Elements, trial after trial, in chunks of one size, and how many are real; the last element is repeated.
 
-    A chunk holds as many elements for every local device; the memory is that of each.
+    A chunk holds as many elements for every local device.
     """
     case, grid = batch.cases[0], plan.grid
     compensating = sum(method != "standard" for method in plan.methods)
     each = element_bytes(len(case.path), len(case.departure), batch.sizes, compensating)
     count = len(batch.cases) * len(grid)
     devices = jax.local_device_count()
-    size = devices * int(max(1.0, min(plan.memory / each, -(-count // devices))))
+    memory = plan.memory / (devices if jax.default_backend() == "cpu" else 1)
+    size = devices * int(max(1.0, min(memory / each, -(-count // devices))))
     for first in range(0, count, size):
         at = np.minimum(np.arange(first, first + size), count - 1)
         yield at // len(grid), grid[at % len(grid)], min(size, count - first)

@@ -19,7 +19,7 @@ from jaxsat.config import Config, Noise
 from jaxsat.errors import InputError
 from jaxsat.inertial import kalman
 from jaxsat.inertial.orientation import Direction, Estimate, Gains, Start, orientation, up_in_body
-from jaxsat.inertial.programs import compiled
+from jaxsat.inertial.programs import compiled, computing
 from jaxsat.inertial.smoother import Rows, smooth, update_rows
 from jaxsat.inertial.strapdown import (
     NavState,
@@ -144,7 +144,7 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
 
     truth: times (s) and positions (m); samples that they do not cover are not scored.
     """
-    with jax.enable_x64(True):
+    with computing():
         prepared = prepare(recording, config)
         known = calibrate_by_rests(without_floor(prepared.trial, config), config)
         trial = jax.tree.map(np.asarray, prepared.trial.calibrated(known))
@@ -241,7 +241,7 @@ def tune_noise(
         raise InputError("tune: there is nothing to do; give at least one recording and one step.")
     loss = position_loss if against_truth else rest_misfit
     count = len(trials) if against_truth else sum(int(np.sum(t.trial.rows.rest)) for t in trials)
-    with jax.enable_x64(True):
+    with computing():
         gradient = compiled(value_and_gradient(lambda logs, trial: loss(trial, jnp.exp(logs))))
 
         def together(logs: Logs) -> tuple[Array, Array]:
