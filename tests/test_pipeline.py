@@ -1,5 +1,6 @@
 """The whole way on simulated recordings: the paper's ratios, no harm without saturation, both orders of segments."""
 
+import tomllib
 from dataclasses import replace
 
 import equinox as eqx
@@ -163,18 +164,26 @@ def test_strides_without_a_rest_between_them_learn_from_the_others(shared_data):
 
 
 @pytest.mark.slow
-def test_map_on_a_recording_that_truly_saturated(shared_data):
-    """A PyShoe trial, scored by Vicon. Slow: a minute of samples is compiled for its own sizes."""
-    path = shared_data / "pyshoe" / "2017-12-15-18-00-40.mat"
-    if not path.is_file():
-        pytest.skip(f"the trial is not at {path}")
-    recording = read(path)
-    found = estimate(recording, load_config(None, method="map"))
-    _, truth = load_pyshoe_truth(path, at=recording.time)
-    mapped, standard = (
-        position_rmse(position, truth) for position in (found.trajectory.position, found.standard_position)
-    )
-    assert mapped <= 0.85 * standard
+def test_map_on_recordings_that_truly_saturated(shared_data):
+    """PyShoe trials, scored by Vicon: in the geometric mean over them nearer by a sixth, in space and on the ground.
+    One by one they need not be: what standard gets wrong in height may make up for what saturation did. Slow: sizes
+    of many trials are compiled."""
+    folder = shared_data / "pyshoe"
+    if not (folder / "splits.toml").is_file():
+        pytest.skip(f"the trials are not at {folder}")
+    ratios = []
+    for name in tomllib.loads((folder / "splits.toml").read_text())["saturated"]:
+        path = folder / f"{name}.mat"
+        recording = read(path)
+        found = estimate(recording, load_config(None, method="map"))
+        _, truth = load_pyshoe_truth(path, at=recording.time)
+        mapped, standard = (
+            [position_rmse(position, truth, axes=axes) for axes in (3, 2)]
+            for position in (found.trajectory.position, found.standard_position)
+        )
+        ratios.append(np.divide(mapped, standard))
+    assert len(ratios) == 12
+    assert (np.exp(np.mean(np.log(ratios), axis=0)) <= 0.85).all()
 
 
 @pytest.mark.parametrize("method", [*PAPER, "map"])

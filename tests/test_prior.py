@@ -10,6 +10,7 @@ from jaxsat.saturation.experience import NODES, Experience
 from jaxsat.saturation.prior import (
     CREDIT,
     LEAST_LEVEL,
+    LEAST_ROUGHNESS,
     ORDER,
     SHARE,
     WIDTH,
@@ -19,6 +20,7 @@ from jaxsat.saturation.prior import (
     learn,
     of_values,
     quadratic_form,
+    roughness,
 )
 
 N = 3000
@@ -107,7 +109,7 @@ OF_VALUES, FORM = jax.jit(of_values), jax.jit(quadratic_form)
 def prior() -> SignalPrior:
     kernel = np.stack([kernel_of(filter_of(PHI), variance) for variance in SIGMA**2])
     nodes = 6, len(NODES)
-    nothing = jnp.ones(nodes), jnp.zeros(nodes, bool), Experience.none()
+    nothing = jnp.ones(nodes), jnp.zeros(nodes, bool), jnp.ones(SHORT.shape), Experience.none()
     return SignalPrior(jnp.asarray(kernel), jnp.asarray(SIGMA**2), *nothing)
 
 
@@ -256,6 +258,7 @@ def test_what_was_far_off_is_believed_less_but_filled_alike(prior):
     np.testing.assert_array_equal(doubted.covariance, found.covariance)
     np.testing.assert_allclose(doubted.believed, np.outer(sd, sd) * found.covariance, atol=1e-12)
     np.testing.assert_allclose(doubted.variance, sd**2 * found.variance)
+    np.testing.assert_allclose(doubted.rough, found.rough / sd**2)
 
 
 def test_what_would_be_worse_filled_is_marked_by_channel_and_length(prior):
@@ -267,3 +270,56 @@ def test_what_would_be_worse_filled_is_marked_by_channel_and_length(prior):
     variance = np.diagonal(np.linalg.inv(found.precision))
     expected = np.where(SIGN != 0, variance + np.where(found.harmful, mean**2, 0.0), 0.0)
     np.testing.assert_allclose(found.variance, expected, rtol=1e-8)
+
+
+def test_a_gap_is_as_rough_as_its_samples_are_on_average(prior):
+    roughness = np.random.default_rng(6).uniform(0.1, 3.0, size=SHORT.shape)
+    found = known(eqx.tree_at(lambda p: p.roughness, prior, jnp.asarray(roughness)))
+    expected = [roughness[30:33, 1].mean()] * 3 + [roughness[35, 1], roughness[32, 4]]
+    np.testing.assert_allclose(found.rough[:5], expected)
+    np.testing.assert_array_equal(found.believed, known(prior).believed)
+
+
+def test_roughness_is_told_by_the_other_channels():
+    """Written out, sample by sample; where none of them is sound it is one."""
+    rng, half = np.random.default_rng(4), 3
+    x = np.cumsum(np.cumsum(rng.normal(size=(120, 6)) * rng.uniform(0.1, 3.0, size=(120, 1)), axis=0), axis=0)
+    sound, near = rng.random((120, 6)) < 0.9, rng.random((120, 6)) < 0.5
+    sound[40:60] = False
+    sound[52, 2] = sound[51, 2] = sound[53, 2] = True
+    second = x[2:] - 2.0 * x[1:-1] + x[:-2]
+    square = {}
+    for t in range(1, 119):
+        for j in range(6):
+            if sound[t - 1 : t + 2, j].all():
+                square[t, j] = second[t - 1, j] ** 2
+    expected = np.ones((120, 6))
+    for c in range(6):
+        usual = [
+            np.mean([square[t, j] for t in range(120) if (t, j) in square and near[t, c]]) for j in range(6)
+        ]
+        for t in range(120):
+            told = []
+            for j in set(range(6)) - {c}:
+                about = [square[u, j] for u in range(t - half, t + half + 1) if (u, j) in square]
+                told += [np.mean(about) / usual[j]] if about else []
+            expected[t, c] = np.sqrt(max(np.mean(told), LEAST_ROUGHNESS)) if told else 1.0
+    found = jax.jit(roughness)(*map(jnp.asarray, (x, sound, near, half)))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert (expected[45:48] == 1.0).all() and expected[52, 0] != 1.0 == expected[52, 2]
+
+
+def test_innovations_over_their_roughness_are_alike_on_average(walk):
+    """Where all channels grow a hundredfold together, so does the variance that a gap is believed to have; half of it
+    by its logarithm, and on average what was learned."""
+    loud = np.where(np.arange(N) >= N // 2, 10.0, 1.0)[:, None]
+    second = np.diff(walk, 2, axis=0, prepend=np.zeros((2, 6)))
+    sign = np.zeros((N, 6), int)
+    sign[50::100] = 1
+    found = learned(np.cumsum(np.cumsum(loud * second, axis=0), axis=0), sign)
+    calm, wild = np.asarray(found.roughness[200:1400]), np.asarray(found.roughness[1600:2800])
+    np.testing.assert_allclose(wild.mean(axis=0) / calm.mean(axis=0), 10.0, rtol=0.1)
+    # Mean of eₜ²/roughnessₜ over that of eₜ².
+    calm_root, wild_root = calm.mean(axis=0), wild.mean(axis=0)
+    expected = (1.0 / calm_root + 100.0 / wild_root) / 101.0
+    np.testing.assert_allclose(expected, 1.0, rtol=0.1)

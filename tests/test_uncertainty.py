@@ -50,6 +50,7 @@ def known_segment(scale: float):
         expected=jnp.zeros(8),
         alone=jnp.zeros(8),
         variance=jnp.diagonal(covariance),
+        rough=jnp.ones(8),
         harmful=jnp.zeros(8, bool),
     )
     segment = build(False)
@@ -176,6 +177,25 @@ def test_hidden_peaks_that_were_far_off_widen_what_is_known():
         sd = times * np.sqrt(np.diagonal(covariance))
         np.testing.assert_allclose(found.sd[:6], deviation(delta, sd, bound, delta), rtol=1e-6)
     assert (np.asarray(known.sd)[:6] > np.asarray(plain.sd)[:6]).all()
+
+
+def test_values_of_a_rough_gap_are_known_less_well_but_not_their_sum():
+    """What the sum says of each value stays; the rest of its variance is scaled."""
+    segment = known_segment(1.0)
+    rough = eqx.tree_at(lambda s: s.known.rough, segment, jnp.full(8, 9.0))
+    slope, nothing = jnp.zeros(8), 6 * (jnp.zeros(8),)
+    plain, found = (JUDGE(s, DELTA, jnp.zeros(()), slope, nothing, nothing) for s in (segment, rough))
+    covariance, pair = np.asarray(segment.known.covariance)[:6, :6], np.ix_([0, 1], [0, 1])
+    row = covariance[pair].sum(axis=1)
+    summed = row**2 / row.sum()
+    # The other gaps have one value, which is its own sum.
+    variance = np.diagonal(covariance).copy()
+    variance[:2] = summed + 9.0 * (variance[:2] - summed)
+    delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
+    np.testing.assert_allclose(found.sd[:6], deviation(delta, np.sqrt(variance), bound, delta), rtol=1e-6)
+    assert (np.asarray(found.sd)[:2] > 1.1 * np.asarray(plain.sd)[:2]).all()
+    for name in ("gap_sd", "identified", "arrival", "asked"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))
 
 
 def test_without_a_rest_the_prior_decides():

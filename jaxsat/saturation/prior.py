@@ -6,6 +6,9 @@ remains is white. Interpolation under it is smooth like a spline but keeps the r
 (autocorrelation of a): Ω_ij = c(|i − j|) between saturated samples i and j of a channel. Unlike a pure difference
 penalty the prior is proper: what a gap lost on average is also known to be a fraction of the rail, which only long
 gaps feel. And what it predicts is known to a share only (`SHARE`).
+
+The white remainder is not as large everywhere: where a foot strikes the ground it is a hundred times what it is in
+its swing. How large it is in a gap the other channels tell (`roughness`); what is said of filled values follows it.
 """
 
 import equinox as eqx
@@ -22,6 +25,10 @@ ORDER = 4
 # An autoregression is learned from samples within so many seconds of a gap of its channel: movement that is as
 # fast as what was lost, not the average of rest and movement.
 REACH = 0.1
+# Roughness is that of the samples within so many seconds.
+MOMENT = 0.05
+# The mean is not less than so much of the usual one.
+LEAST_ROUGHNESS = 1e-4
 # Windows without which the channel's other movement is taken too.
 FEWEST = 100
 # Root mean square of what a gap lost (δ), in rails.
@@ -44,9 +51,12 @@ class SignalPrior(eqx.Module):
     innovation: Float[Array, "6"]
     """σ², the variance of a sample given all before it."""
     excess: Float[Array, "6 L"]
-    """By how much the squares of the errors of hidden peaks exceed what the prior says, by length (`NODES`)."""
+    """By how much the squares of the errors of the sums of hidden peaks exceed what the prior says, by length
+    (`NODES`)."""
     harmful: Bool[Array, "6 L"]
     """Whether hidden peaks of that length were further off filled than cut off."""
+    roughness: Float[Array, "N 6"]
+    """About each sample, variance of the innovation over `innovation`."""
     experience: Experience
     """What the search before taught; with none of it at first."""
 
@@ -63,16 +73,54 @@ def learn(
     The normal equations carry a weak prior at zero coefficients, which is the second-difference prior.
     """
     reach = jnp.asarray(REACH / period, int)
-    channels = jax.vmap(lambda x, s, ok: _learn_channel(x, s != 0, ok & moving, reach), in_axes=1)
-    return SignalPrior(*channels(signal, sign, clean), Experience.none())
+    sound = clean & moving[:, None]
+    near = jax.vmap(lambda s: _near(s != 0, reach), in_axes=1, out_axes=1)(sign)
+    rough = roughness(signal, sound, near, jnp.asarray(MOMENT / period, int))
+    *found, scale = jax.vmap(_learn_channel, in_axes=1)(signal, sign != 0, sound, near, rough)
+    return SignalPrior(*found, rough * scale[None], Experience.none())
 
 
-def _learn_channel(x, saturated, ok, reach):
-    steps = jnp.arange(len(x))
-    # Distance to the nearest saturated sample, by running maxima from both sides.
-    behind = steps - jax.lax.cummax(jnp.where(saturated, steps, -len(x)))
-    ahead = jax.lax.cummin(jnp.where(saturated, steps, 2 * len(x)), reverse=True) - steps
-    near = jnp.minimum(behind, ahead) <= reach
+def _near(saturated: Bool[Array, "N"], reach: Int[Array, ""]) -> Bool[Array, "N"]:
+    """Within so many samples of a saturated one."""
+    steps = jnp.arange(len(saturated))
+    # Distance to the nearest, by running maxima from both sides.
+    behind = steps - jax.lax.cummax(jnp.where(saturated, steps, -len(saturated)))
+    ahead = jax.lax.cummin(jnp.where(saturated, steps, 2 * len(saturated)), reverse=True) - steps
+    return jnp.minimum(behind, ahead) <= reach
+
+
+def roughness(
+    signal: Float[Array, "N 6"], sound: Bool[Array, "N 6"], near: Bool[Array, "N 6"], moment: Int[Array, ""]
+) -> Float[Array, "N 6"]:
+    """How large the innovations of each channel are about each sample, as a variance in any unit of the channel.
+
+    Told by the other channels, which seldom saturate at the same time: their mean squared second differences within
+    `moment` samples, each over what it is near the gaps of the channel, and the root of the mean of these. Squared
+    errors within gaps grow with that root (slope 1.04 of their logarithms, over all clipped recordings of the board).
+    """
+    whole = sound[1:-1] & sound[2:] & sound[:-2]
+    square = jnp.where(whole, (signal[2:] - 2.0 * signal[1:-1] + signal[:-2]) ** 2, 0.0)
+    whole, square = (jnp.pad(x.astype(signal.dtype), ((1, 1), (0, 0))) for x in (whole, square))
+    steps = jnp.arange(len(signal))
+    first, last = jnp.maximum(steps - moment, 0), jnp.minimum(steps + moment + 1, len(signal))
+
+    def about(x):
+        total = jnp.pad(jnp.cumsum(x, axis=0), ((1, 0), (0, 0)))
+        return jnp.maximum(total[last] - total[first], 0.0)
+
+    count = about(whole)
+    local = about(square) / jnp.maximum(count, 1.0)
+    beside = near.astype(signal.dtype)
+    # Of each other channel (columns) near the gaps of a channel (rows).
+    usual = (beside.T @ square) / jnp.maximum(beside.T @ whole, 1.0)
+    tells = (usual > 0.0) & ~jnp.eye(6, dtype=bool)
+    weight = jnp.where(tells, 1.0 / jnp.where(tells, usual, 1.0), 0.0)
+    told = (count > 0.0).astype(signal.dtype) @ tells.T.astype(signal.dtype)
+    mean = jnp.where(told > 0.0, local @ weight.T / jnp.maximum(told, 1.0), 1.0)
+    return jnp.sqrt(jnp.maximum(mean, LEAST_ROUGHNESS))
+
+
+def _learn_channel(x, saturated, ok, near, rough):
     second = x[2:] - 2.0 * x[1:-1] + x[:-2]
     count = len(second) - ORDER
     lagged = [second[ORDER - lag : ORDER - lag + count] for lag in range(ORDER + 1)]
@@ -94,7 +142,10 @@ def _learn_channel(x, saturated, ok, reach):
     kernel = jnp.stack([jnp.sum(predictor[: size - k] * predictor[k:]) for k in range(size)])
     kernel = kernel / innovation
     excess, harmful = hidden_peaks(x, ok, jnp.max(jnp.where(saturated, jnp.abs(x), 0.0)), kernel)
-    return kernel, innovation, excess, harmful
+    # Innovations over their roughness are what is alike.
+    left = weight * (lagged[0] - phi @ jnp.stack(lagged[1:])) ** 2
+    scale = jnp.sum(left / rough[ORDER + 2 :]) / jnp.maximum(jnp.sum(left), 1e-300)
+    return kernel, innovation, excess, harmful, jnp.where(scale > 0.0, scale, 1.0)
 
 
 def hidden_peaks(
@@ -161,6 +212,8 @@ class Known(eqx.Module):
 
     A smoother takes values as independent, though errors within a gap go together. Letting each stand for its whole
     gap (row sums of the covariance) was worse: rests have told most of that sum already."""
+    rough: Float[Array, "m"]
+    """By what to scale the believed variance of each once the sum of its gap is known."""
     harmful: Bool[Array, "m"]
     """Not to be filled."""
 
@@ -222,6 +275,7 @@ def of_values(
     # What gaps like them lost.
     gaps = jnp.where(real[:, None], gap[:, None] == jnp.arange(len(gap))[None], False).astype(sign.dtype)
     alone, some = gaps.T @ mean, jnp.argmax(gaps, axis=0)
+    rough = gaps.T @ jnp.where(real, prior.roughness[sample, channel] / jnp.maximum(length, 1.0), 0.0)
     usual = habit(prior.experience, channel[some], sign[some], jnp.sum(gaps, axis=0))
     _, believed = with_habit(mean, believed, gaps, usual)
     mean, covariance = with_habit(mean, covariance, gaps, usual)
@@ -235,5 +289,7 @@ def of_values(
         expected=(gaps.T @ mean)[gap],
         alone=alone[gap],
         variance=jnp.where(real, variance, 0.0),
+        # Hidden peaks spoke of the sums.
+        rough=rough[gap] / excess,
         harmful=harmful,
     )

@@ -109,9 +109,13 @@ def uncertainty(
     moved = jnp.stack(effects, axis=1)
     removed = jnp.einsum("ik,ij,jk->k", moved, before - after, moved)
     sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
+    # Rests tell of sums. Within a gap it is the prior that claims, as if innovations were alike in all gaps.
+    row, of_sums = jnp.sum(jnp.where(together, after, 0.0), axis=1), variance(after)
+    summed = jnp.where(of_sums > 0.0, row**2 / jnp.where(of_sums > 0.0, of_sums, 1.0), 0.0)
+    sd_here = jnp.sqrt(jnp.maximum(summed + known.rough * (sd**2 - summed), 1e-300))
     wider = widened(centre, sd, segment.bound) / sd
     gap_sd = jnp.sqrt(jnp.maximum(variance(after * wider[:, None] * wider[None]), 1e-300))
-    of_value = truncated_deviation(centre, sd, segment.bound, delta)
+    of_value = truncated_deviation(centre, sd_here, segment.bound, delta)
     of_sum = truncated_deviation(of_gap(centre), gap_sd, of_gap(segment.bound), of_gap(delta))
     return Uncertainty(
         sd=jnp.where(real, jnp.where(known.harmful, jnp.sqrt(known.variance), of_value), 0.0),
