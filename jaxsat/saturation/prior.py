@@ -76,8 +76,9 @@ def learn(
     sound = clean & moving[:, None]
     near = jax.vmap(lambda s: _near(s != 0, reach), in_axes=1, out_axes=1)(sign)
     rough = roughness(signal, sound, near, jnp.asarray(MOMENT / period, int))
-    *found, scale = jax.vmap(_learn_channel, in_axes=1)(signal, sign != 0, sound, near, rough)
-    return SignalPrior(*found, rough * scale[None], Experience.none())
+    channels = jax.vmap(_learn_channel, in_axes=1)
+    kernel, innovation, excess, harmful, scale = channels(signal, sign != 0, sound, near, rough)
+    return SignalPrior(kernel, innovation, excess, harmful, rough * scale[None], Experience.none())
 
 
 def _near(saturated: Bool[Array, "N"], reach: Int[Array, ""]) -> Bool[Array, "N"]:
