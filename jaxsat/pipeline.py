@@ -142,9 +142,16 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     calibration = calibrate_by_rests(searched, config)
     clock.lap("calibration")
     sure = trial.calibrated(calibration)
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+
+    def smooth_beside(trial: Trial):
+        # A device that is chosen for a while is a thread's own setting, too.
+        with jax.default_device(device):
+            return _smooth(trial, config)
+
     # What the search does not wait for goes on beside it.
     with ThreadPoolExecutor(1) as beside:
-        ignoring = beside.submit(_smooth, sure, config)
+        ignoring = beside.submit(smooth_beside, sure)
         compensated = None
         if config.method != "standard" and len(gaps):
             options = search_options(config, config.method)
@@ -162,7 +169,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 for extra in (fills.slack, fills.variance)
             )
             # How sure the path is, is another question.
-            doubted = beside.submit(_smooth, sure, config) if (fills.slack != fills.variance).any() else None
+            doubted = beside.submit(smooth_beside, sure) if (fills.slack != fills.variance).any() else None
             compensated = _smooth(path, config)
             if doubted is not None:
                 covariance = doubted.result()[0].covariance
