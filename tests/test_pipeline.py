@@ -171,7 +171,7 @@ def test_map_on_recordings_that_truly_saturated(shared_data):
     folder = shared_data / "pyshoe"
     if not (folder / "splits.toml").is_file():
         pytest.skip(f"the trials are not at {folder}")
-    ratios = []
+    ratios = {}
     for name in tomllib.loads((folder / "splits.toml").read_text())["saturated"]:
         path = folder / f"{name}.mat"
         recording = read(path)
@@ -181,9 +181,11 @@ def test_map_on_recordings_that_truly_saturated(shared_data):
             [position_rmse(position, truth, axes=axes) for axes in (3, 2)]
             for position in (found.trajectory.position, found.standard_position)
         )
-        ratios.append(np.divide(mapped, standard))
+        ratios[name] = np.divide(mapped, standard)
     assert len(ratios) == 12
-    assert (np.exp(np.mean(np.log(ratios), axis=0)) <= 0.85).all()
+    assert (np.exp(np.mean(np.log([*ratios.values()]), axis=0)) <= 0.85).all()
+    # Where errors of height make up for each other, the ground shows it.
+    assert ratios["2017-12-15-18-00-40"][1] <= 0.85
 
 
 @pytest.mark.parametrize("method", [*PAPER, "map"])

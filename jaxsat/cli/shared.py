@@ -117,7 +117,9 @@ def use_all_cores() -> None:
 
     told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if not told and jax.config.jax_num_cpu_devices < 1:  # type: ignore[attr-defined]
-        jax.config.update("jax_num_cpu_devices", usable_cores())
+        # Too late where the process has used JAX before: then it is one.
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", usable_cores())
 
 
 def tell(text: str, warnings: list[str], quiet: bool, strict: bool) -> None:
