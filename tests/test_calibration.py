@@ -135,6 +135,11 @@ def found_on(trial, sd, steps=3):
     samples = Samples(trial.signal, trial.period, trial.variance)
     prior = NavState(*jax.tree.leaves(trial.prior))
     given = (samples, trial.rows, prior, trial.prior_covariance, trial.gravity, jnp.asarray(sd))
+    return stepped(given, steps)
+
+
+def stepped(given, steps):
+    """Gauss-Newton steps from no calibration."""
     found = Calibration.none()
     for _ in range(steps):
         found = CALIBRATE(*given, found)
@@ -199,9 +204,7 @@ def test_the_lever_of_a_foot_that_rolls_is_found_and_its_path_mended():
     prior = NavState(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3), jnp.zeros(3))
     known = (prior, jnp.diag(jnp.array([1e-5, 1e-5, 0, 0, 0, 0, 1e-4, 1e-4, 1e-4])), jnp.asarray(9.81))
     sd = jnp.repeat(jnp.array([0.0, 0.0, 0.1]), 3)
-    found = Calibration.none()
-    for _ in range(2):
-        found = CALIBRATE(samples, rows, *known, sd, found)
+    found = stepped((samples, rows, *known, sd), 2)
     np.testing.assert_allclose(found.constants[6:9:2], lever[::2], atol=5e-3)
     # Nothing turns about y's own axis: only the prior speaks of the lever along it.
     assert abs(found.constants[7]) < 1e-3 and found.sd[7] == pytest.approx(0.1, rel=0.01)

@@ -310,8 +310,7 @@ def test_roughness_is_told_by_the_other_channels():
 
 
 def test_innovations_over_their_roughness_are_alike_on_average(walk):
-    """Where all channels grow a hundredfold together, so does the variance that a gap is believed to have; half of it
-    by its logarithm, and on average what was learned."""
+    """Where variances of all channels grow a hundredfold, roughness grows by the root; its mean is that learned."""
     loud = np.where(np.arange(N) >= N // 2, 10.0, 1.0)[:, None]
     second = np.diff(walk, 2, axis=0, prepend=np.zeros((2, 6)))
     sign = np.zeros((N, 6), int)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial, wraps
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ from jaxsat.saturation.layout import Sizes
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording
 from jaxsat.studies import elements
+from jaxsat.studies import sweep as sweep_module
 from jaxsat.studies.motions import Bar
 from jaxsat.studies.simulate import Sensor, simulate
 from jaxsat.studies.sweep import sweep
@@ -240,3 +242,13 @@ def test_recordings_are_loaded_in_turn_under_the_names_given(table, trials):
     assert failed.startswith("file 1")
     expected = table.assign(trial=table["trial"].replace(names)).drop(columns="note")
     pd.testing.assert_frame_equal(found.iloc[1:].drop(columns="note").reset_index(drop=True), expected)
+
+
+def test_the_devices_of_one_cpu_share_the_memory(monkeypatch):
+    """Four elements at a time in all, not on each of them."""
+    assert jax.local_device_count() == 2, "the tests run on two devices of a CPU"
+    monkeypatch.setattr(sweep_module, "element_bytes", lambda *_: 1.0)
+    case = SimpleNamespace(path=np.zeros((10, 3)), departure=np.zeros(2, int))
+    batch = sweep_module._Batch([case] * 8, ["bar"] * 8, None)
+    plan = sweep_module._Plan(Config(), ("direct",), np.ones((1, 4)), 4.0)
+    assert [real for *_, real in sweep_module._chunks(batch, plan)] == [4, 4]

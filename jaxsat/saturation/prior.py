@@ -97,7 +97,8 @@ def roughness(
 
     Told by the other channels, which seldom saturate at the same time: their mean squared second differences within
     `moment` samples, each over what it is near the gaps of the channel, and the root of the mean of these. Squared
-    errors within gaps grow with that root (slope 1.04 of their logarithms, over all clipped recordings of the board).
+    errors within gaps grow with that root (slope 1.04 of their logarithms, over the recordings on which
+    the board scores intervals).
     """
     whole = sound[1:-1] & sound[2:] & sound[:-2]
     square = jnp.where(whole, (signal[2:] - 2.0 * signal[1:-1] + signal[:-2]) ** 2, 0.0)
