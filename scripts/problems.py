@@ -11,7 +11,7 @@ from peers import shortest
 from peers.strapdown import bare_trials, numba_strapdown
 
 from jaxsat import Sensor, load_config, simulate
-from jaxsat.inertial.programs import compiled
+from jaxsat.inertial.programs import compiled, computing
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import prepare
@@ -21,6 +21,8 @@ from jaxsat.saturation.layout import Sizes, Trial, padded_sizes
 from jaxsat.saturation.methods import Options
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import find_segments
+from jaxsat.studies import sweep
+from jaxsat.studies.elements import run_elements
 from jaxsat.studies.motions import Bar, Walk
 from jaxsat.studies.simulate import GRAVITY, Truth
 
@@ -107,6 +109,37 @@ def run_direct(batch: Batch, whole: bool) -> Callable:
 def strapdown_seconds(trials: int = 256, samples: int = 512, all_states: bool = True) -> float:
     signal, initial = bare_trials(trials, samples)
     return shortest(partial(numba_strapdown, signal, 0.005, initial, GRAVITY, all_states=all_states), 50)
+
+
+def swept(trials: int, rails: int, memory: float) -> Callable:
+    """A sweep of bars of 512 samples at rails from 4 to 10 rad/s by `direct`, but for the preparation of its trials.
+
+    The function returns the scores of its chunks.
+    """
+    recording, truth = simulate(Bar(), rate=320.0, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
+    recording = with_rests(recording, truth)
+    config = load_config(None, **{"saturation.gyr_bound": 5.0})
+    grid = np.linspace(4.0, 10.0, rails).tolist()
+    plan = sweep._plan(config, ("direct",), grid, [np.inf], None, None, memory)
+    with computing():
+        (batch,), _ = sweep._batches({"bar": lambda: recording}, plan)
+    (case,), rng = batch.cases, np.random.default_rng(0)
+
+    def noisy():
+        signal = np.array(case.trial.signal)
+        signal[: len(recording), :3] += 1e-3 * rng.normal(size=(len(recording), 3))
+        return eqx.tree_at(lambda c: c.trial.signal, case, signal)
+
+    batch = batch._replace(cases=[noisy() for _ in range(trials)])
+
+    def run():
+        with computing():
+            return [
+                run_elements(batch.cases, which, held, values, batch.sizes, (OPTIONS,), config, False)
+                for which, values, held, _ in sweep._chunks(batch, plan)
+            ]
+
+    return run
 
 
 def walk(seconds: float, seed: int = 0, rail: float = 5.0):

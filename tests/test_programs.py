@@ -12,7 +12,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from threadpoolctl import threadpool_info
 
 from jaxsat.inertial import programs
-from jaxsat.inertial.programs import computing, keep_traces, stored_jit
+from jaxsat.inertial.programs import computing, keep_traces, on_processor, stored_jit
 
 TRACED = []
 
@@ -118,6 +118,19 @@ def test_inside_another_program_it_is_the_function(folder):
     found = jax.vmap(lambda value: run(Pair(value, "a"), jnp.asarray(2.0), 3)[1]["sum"])(jnp.ones((4, 3)))
     np.testing.assert_allclose(found, 3.0)
     assert not folder.exists()
+
+
+def test_each_kind_of_device_has_traces_of_its_own(folder, monkeypatch):
+    """On the CPU beside an accelerator a program runs that was exported for a CPU."""
+    call = fresh()
+    with on_processor():
+        check(call(PAIR, jnp.asarray(2.0), 3))
+    check(call(PAIR, jnp.asarray(2.0), 3))
+    assert len(TRACED) == 1, "here both are the CPU"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with on_processor():
+        assert programs._platform() == "cpu"
+    assert programs._platform() == "gpu"
 
 
 def test_what_runs_within_another_program_has_a_trace_too(folder):

@@ -248,7 +248,7 @@ def test_the_devices_of_one_cpu_share_the_memory(monkeypatch):
     """Four elements at a time in all, not on each of them."""
     assert jax.local_device_count() == 2, "the tests run on two devices of a CPU"
     monkeypatch.setattr(sweep_module, "element_bytes", lambda *_: 1.0)
-    case = SimpleNamespace(path=np.zeros((10, 3)), departure=np.zeros(2, int))
+    case = SimpleNamespace(trial=SimpleNamespace(signal=np.zeros((10, 6))), departure=np.zeros(2, int))
     batch = sweep_module._Batch([case] * 8, ["bar"] * 8, None)
     plan = sweep_module._Plan(Config(), ("direct",), np.ones((1, 4)), 4.0)
     assert [real for *_, real in sweep_module._chunks(batch, plan)] == [4, 4]

@@ -10,7 +10,7 @@ import pickle
 import platform
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -54,6 +54,15 @@ def computing() -> Iterator[None]:
 def usable_cores() -> int:
     """That this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def on_processor() -> AbstractContextManager[Any]:
+    """In here JAX makes arrays and runs programs on the CPU, where one trial after the other takes less time."""
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    # JAX may have been told to use the accelerator alone.
+    except RuntimeError:
+        return nullcontext()
 
 
 def compiled(function: F, options: Options = OPTIONS) -> F:
@@ -106,7 +115,8 @@ def stored_jit(function: F, options: Options | None = OPTIONS) -> F:
             return jitted(*args)
         kinds = [jax.typeof(leaf) for leaf in leaves]
         name = f"{function.__module__}.{function.__qualname__}"
-        parts = name, _surroundings(), jax.config.jax_enable_x64, structure, rest, kinds  # type: ignore[attr-defined]
+        where = _platform()
+        parts = name, _surroundings(), where, jax.config.jax_enable_x64, structure, rest, kinds  # type: ignore[attr-defined]
         key = hashlib.sha256(repr(parts).encode()).hexdigest()
         if key not in _loaded:
             path = _folder / f"{key}.trace"
@@ -114,7 +124,7 @@ def stored_jit(function: F, options: Options | None = OPTIONS) -> F:
             def whole(*given):
                 return function(*eqx.combine(jax.tree.unflatten(structure, given), rest))
 
-            _loaded[key] = _read(path, options) or _trace(whole, kinds, path, options)
+            _loaded[key] = _read(path, options) or _trace(whole, kinds, where, path, options)
         program = _loaded[key]
         return jitted(*args) if program is None else program(*leaves)
 
@@ -129,7 +139,15 @@ def _surroundings() -> str:
         code.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
     packages = ("jax", "jaxlib", "equinox", "numpy", "optax", "jaxopt")
     versions = [f"{name} {version(name)}" for name in packages]
-    return " ".join([code.hexdigest(), platform.python_version(), jax.default_backend(), *versions])
+    return " ".join([code.hexdigest(), platform.python_version(), *versions])
+
+
+def _platform() -> str:
+    """The kind of device that programs run on here."""
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+    if device is None:
+        return jax.default_backend()
+    return device if isinstance(device, str) else device.platform
 
 
 def _program(exported: Any, skeleton: Any, options: Options | None) -> Callable[..., Any]:
@@ -151,7 +169,7 @@ def _read(path: Path, options: Options | None) -> Callable[..., Any] | None:
 
 
 def _trace(
-    function: Callable[..., Any], kinds: list[Any], path: Path, options: Options | None
+    function: Callable[..., Any], kinds: list[Any], where: str, path: Path, options: Options | None
 ) -> Callable[..., Any] | None:
     from jax import export
 
@@ -164,7 +182,8 @@ def _trace(
 
     shapes = [jax.ShapeDtypeStruct(kind.shape, kind.dtype) for kind in kinds]
     try:
-        exported = export.export(jax.jit(flat))(*shapes)
+        # JAX exports for a CPU or for the accelerator that there is.
+        exported = export.export(jax.jit(flat), platforms=("cpu",) if where == "cpu" else None)(*shapes)
     # Not every operation of every device can be kept; a fault of the function shows again without.
     except Exception:
         return None

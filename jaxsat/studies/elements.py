@@ -3,13 +3,14 @@
 `score` works on one element; `run_elements` is the one place where `vmap` runs over many of them.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
@@ -63,14 +64,19 @@ class Case(eqx.Module):
     change: Float[Arrays, "6"]
     """Share of a sensor's change between samples that is noise, of each channel."""
     length: Int[Arrays, ""]
-    path: Float[Arrays, "N 3"]
-    """Of the recording as given, by the standard smoother."""
+    path: Float[Arrays, "N 3"] | None
+    """What to compare with; None for that of the recording as given, by the standard smoother."""
 
 
-def make_case(prepared: Prepared, busy: Int[np.ndarray, "B"], lanes: int, config: Config) -> Case:
-    """A trial of which the segments `busy` may saturate."""
+def make_case(
+    prepared: Prepared,
+    busy: Int[np.ndarray, "B"],
+    lanes: int,
+    config: Config,
+    path: Float[np.ndarray, "N 3"] | None = None,
+) -> Case:
+    """A trial of which the segments `busy` may saturate; path: `Case.path`."""
     trial, segments = prepared.trial, prepared.segments
-    path = _standard(trial, constants_sd(config), jnp.asarray(config.smoother.relinearisations))
     # What a segment without a departure arrives at tells nothing about it. Nor does a padded lane have anything to
     # solve.
     rest_end = np.where(segments.departure >= 0, segments.rest_end, segments.arrival)
@@ -82,7 +88,7 @@ def make_case(prepared: Prepared, busy: Int[np.ndarray, "B"], lanes: int, config
         rest_end=pad(rest_end[busy], lanes),
         change=np.array(config.noise.changes),
         length=np.asarray(len(prepared.rest)),
-        path=np.asarray(path),
+        path=path,
     )
 
 
@@ -107,7 +113,9 @@ def element_bytes(length: int, lanes: int, sizes: Sizes, compensating: int) -> f
 
 
 def run_elements(
-    cases: list[Case],
+    cases: Sequence[Case],
+    which: Int[np.ndarray, "C"],
+    held: int,
     values: Float[np.ndarray, "C 4"],
     sizes: Sizes,
     options: tuple[Options, ...],
@@ -116,15 +124,23 @@ def run_elements(
 ) -> dict[str, dict[str, np.ndarray]]:
     """The scores of some elements, by method.
 
-    values: gyroscope rail, accelerometer rail and the two bounds of each element. Their number is a multiple of
-    that of the local devices, among which they are spread.
+    which, values: the case of each element, and its gyroscope rail, accelerometer rail and two bounds. Their number
+    is a multiple of that of the local devices, among which they are spread. held: so many cases at most are among
+    them; calls that agree in it share a program.
     """
+    devices = jax.local_device_count()
+    mesh = jax.make_mesh((devices,), ("elements",), (AxisType.Auto,), devices=jax.local_devices())
     rails, bounds = np.repeat(values[:, :2], 3, axis=1), np.repeat(values[:, 2:], 3, axis=1)
-    mesh = jax.make_mesh((jax.local_device_count(),), ("elements",), devices=jax.local_devices())
-    elements = jax.tree.map(lambda *x: np.stack(x), *cases), rails, bounds
-    stacked, rails, bounds = jax.device_put(elements, NamedSharding(mesh, PartitionSpec("elements")))
+    used, index = np.unique(which, return_inverse=True)
+    # Each case travels to the devices once, however many rails it is clipped at.
+    used = np.resize(used, -(-held // devices) * devices)
+    stacked = jax.tree.map(lambda *x: np.stack(x), *(cases[i] for i in used))
+    whole, index, rails, bounds = jax.device_put(
+        (stacked, index, rails, bounds), NamedSharding(mesh, PartitionSpec("elements"))
+    )
     found = _scores(
-        stacked,
+        whole,
+        index,
         rails,
         bounds,
         mesh,
@@ -139,16 +155,32 @@ def run_elements(
 
 
 @compiled
-def _scores(cases: Case, rails, bounds, mesh: Mesh, *settings) -> Scores:
-    # Devices run on their own: a search that is done in one need not wait for another's.
+def _scores(cases: Case, index, rails, bounds, mesh: Mesh, *settings) -> Scores:
+    _, _, wanted, _, relinearisations, _ = settings
     spread = PartitionSpec("elements")
-    return jax.shard_map(
-        lambda *elements: _scores_of_device(*elements, *settings),
-        mesh=mesh,
-        in_specs=spread,
-        out_specs=spread,
-        check_vma=False,
-    )(cases, rails, bounds)
+
+    def on_devices(function, *spread_out):
+        # Devices run on their own: a search that is done in one need not wait for another's.
+        return jax.shard_map(function, mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False)(
+            *spread_out
+        )
+
+    if cases.path is None:
+        path = on_devices(lambda trials: _paths_of_device(trials, wanted, relinearisations), cases.trial)
+        cases = eqx.tree_at(lambda c: c.path, cases, path, is_leaf=lambda x: x is None)
+    elements = jax.tree.map(lambda x: x[index], cases)
+    return on_devices(lambda *mine: _scores_of_device(*mine, *settings), elements, rails, bounds)
+
+
+@partial(stored_jit, options=None)
+def _paths_of_device(trials: Trial, wanted, relinearisations) -> Float[Array, "C N 3"]:
+    """Of recordings as given, by the standard smoother."""
+
+    def path(trial: Trial):
+        calibration = _calibration(trial, trial.signal, trial.unfilled_variance, wanted)
+        return _smooth_path(trial, trial.signal, trial.variance, calibration, relinearisations)
+
+    return jax.vmap(path)(trials)
 
 
 @partial(stored_jit, options=None)
@@ -171,7 +203,7 @@ def score(
 
     sweeps: of each method; wanted: prior sd of what is constant, as `Options.calibration_sd`.
     """
-    whole, count = case.trial, len(case.path)
+    whole, count = case.trial, len(case.trial.signal)
     raw = whole.signal + case.offset[None]
     real = jnp.arange(count) < case.length
     beyond = (jnp.abs(raw) >= rail[None]) & real[:, None]
@@ -292,10 +324,3 @@ def _smooth_path(
         relinearisations,
     )
     return smoothed.state.position[:-1]
-
-
-@compiled
-def _standard(trial: Trial, wanted, relinearisations) -> Float[Array, "N 3"]:
-    trial = jax.tree.map(jnp.asarray, trial)
-    calibration = _calibration(trial, trial.signal, trial.unfilled_variance, wanted)
-    return _smooth_path(trial, trial.signal, trial.variance, calibration, relinearisations)

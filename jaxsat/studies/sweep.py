@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
-from jaxsat.inertial.programs import computing, make_room
+from jaxsat.inertial.programs import computing, make_room, on_processor
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
@@ -80,10 +80,16 @@ def sweep(
         total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
         for batch in batches:
             make_room()
-            for indices, values, real in _chunks(batch, plan):
-                cases = [batch.cases[i] for i in indices]
+            for indices, values, held, real in _chunks(batch, plan):
                 scores = run_elements(
-                    cases, values, batch.sizes, options, plan.config, "standard" in plan.methods
+                    batch.cases,
+                    indices,
+                    held,
+                    values,
+                    batch.sizes,
+                    options,
+                    plan.config,
+                    "standard" in plan.methods,
                 )
                 rows += _rows(scores, [batch.names[i] for i in indices[:real]], values, plan.methods)
                 done += real
@@ -176,7 +182,8 @@ def _batches(loaders: Mapping[str, Loader], plan: _Plan) -> tuple[list[_Batch], 
     failed = []
     for name, load in loaders.items():
         try:
-            prepared = prepare(replace(load(), name=name), plan.config)
+            with on_processor():
+                prepared = prepare(replace(load(), name=name), plan.config)
             item = name, prepared, _clipped_most(prepared, lowest, name)
             groups.setdefault(len(prepared.trial.signal), []).append(item)
         except InputError as error:
@@ -214,21 +221,23 @@ def _clipped_most(prepared: Prepared, lowest: Float[np.ndarray, "6"], name: str)
 
 def _chunks(
     batch: _Batch, plan: _Plan
-) -> Iterator[tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C 4"], int]]:
-    """Elements, trial after trial, in chunks of one size, and how many are real; the last element is repeated.
+) -> Iterator[tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C 4"], int, int]]:
+    """Elements, trial after trial, in chunks of one size, of how many trials at most, and how many are real.
 
-    A chunk holds as many elements for every local device.
+    The last element is repeated. A chunk holds as many elements for every local device.
     """
     case, grid = batch.cases[0], plan.grid
     compensating = sum(method != "standard" for method in plan.methods)
-    each = element_bytes(len(case.path), len(case.departure), batch.sizes, compensating)
+    each = element_bytes(len(case.trial.signal), len(case.departure), batch.sizes, compensating)
     count = len(batch.cases) * len(grid)
     devices = jax.local_device_count()
     memory = plan.memory / (devices if jax.default_backend() == "cpu" else 1)
     size = devices * int(max(1.0, min(memory / each, -(-count // devices))))
+    # A chunk may begin and end within the rails of a trial.
+    held = min(len(batch.cases), -(-size // len(grid)) + 1)
     for first in range(0, count, size):
         at = np.minimum(np.arange(first, first + size), count - 1)
-        yield at // len(grid), grid[at % len(grid)], min(size, count - first)
+        yield at // len(grid), grid[at % len(grid)], held, min(size, count - first)
 
 
 def _rows(

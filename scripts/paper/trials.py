@@ -7,7 +7,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 import pandas as pd
@@ -121,10 +120,9 @@ def _elements(made_of: str) -> Elements:
 def _against(truth: Truth, prepared: Prepared, config: Config) -> Case:
     """A case that is compared with the truth, not with the path of the unclipped recording."""
     busy = np.arange(len(prepared.segments))
-    case = make_case(prepared, busy, bucket(len(busy), 1), config)
-    path = np.zeros_like(case.path)
+    path = np.zeros((len(prepared.trial.signal), 3))
     path[: len(truth.position)] = truth.position
-    return eqx.tree_at(lambda c: c.path, case, path)
+    return make_case(prepared, busy, bucket(len(busy), 1), config, path)
 
 
 def score(trials: Elements, values: Float[np.ndarray, "E 4"], chunk: int) -> pd.DataFrame:
@@ -138,8 +136,10 @@ def score(trials: Elements, values: Float[np.ndarray, "E 4"], chunk: int) -> pd.
     count, parts = len(trials.cases) * len(values), []
     for first in range(0, count, chunk):
         at = np.minimum(np.arange(first, first + chunk), count - 1)
-        cases, rows = [trials.cases[i] for i in at // len(values)], values[at % len(values)]
-        found = run_elements(cases, rows, trials.sizes, options, trials.config, standard=True)
+        rows, held = values[at % len(values)], min(len(trials.cases), -(-chunk // len(values)) + 1)
+        found = run_elements(
+            trials.cases, at // len(values), held, rows, trials.sizes, options, trials.config, standard=True
+        )
         real = slice(0, min(chunk, count - first))
         for method, columns in found.items():
             part = pd.DataFrame({name: column[real] for name, column in columns.items()})
