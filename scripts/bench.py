@@ -313,8 +313,8 @@ print(shortest(swept(int(sys.argv[1]), 16, 8e9), 2))
 def gpu() -> Iterator[Row]:
     if jax.default_backend() != "gpu":
         return
-    trials = 10_000
-    accelerated = shortest(swept(trials, 16, 1e11), 2)
+    trials, stats = 10_000, jax.devices()[0].memory_stats()
+    accelerated = shortest(swept(trials, 16, 0.9 * stats["bytes_limit"]), 2)
 
     def on_cores(cores: list[int]) -> float:
         """Seconds of a sweep as large on some of the cores of this machine, extrapolated from a smaller one."""

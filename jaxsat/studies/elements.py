@@ -125,8 +125,8 @@ def run_elements(
     """The scores of some elements, by method.
 
     which, values: the case of each element, and its gyroscope rail, accelerometer rail and two bounds. Their number
-    is a multiple of that of the local devices, among which they are spread. held: so many cases at most are among
-    them; calls that agree in it share a program.
+    is a multiple of that of the local devices, among which they are spread. cases: all of like shapes, of which at
+    most `held` are among the elements; calls that agree in it share a program.
     """
     devices = jax.local_device_count()
     mesh = jax.make_mesh((devices,), ("elements",), (AxisType.Auto,), devices=jax.local_devices())
