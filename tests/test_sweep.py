@@ -251,4 +251,18 @@ def test_the_devices_of_one_cpu_share_the_memory(monkeypatch):
     case = SimpleNamespace(trial=SimpleNamespace(signal=np.zeros((10, 6))), departure=np.zeros(2, int))
     batch = sweep_module._Batch([case] * 8, ["bar"] * 8, None)
     plan = sweep_module._Plan(Config(), ("direct",), np.ones((1, 4)), 4.0)
-    assert [real for *_, real in sweep_module._chunks(batch, plan)] == [4, 4]
+    size = sweep_module._chunk_size(batch, plan)
+    assert [chunk.real for chunk in elements.chunks(8, plan.grid, size)] == [4, 4]
+
+
+def test_chunks_hold_every_element_once_and_no_more_cases_than_they_say():
+    """Whatever their size; of five cases at three rails, and of one."""
+    for cases, size in ((5, 1), (5, 4), (5, 7), (5, 40), (1, 2)):
+        grid = np.arange(12.0).reshape(3, 4)
+        found = list(elements.chunks(cases, grid, size))
+        assert {len(chunk.which) for chunk in found} == {size}
+        assert all(len(set(chunk.which)) <= chunk.held <= cases for chunk in found)
+        which = np.concatenate([chunk.which[: chunk.real] for chunk in found])
+        values = np.concatenate([chunk.values[: chunk.real] for chunk in found])
+        np.testing.assert_array_equal(which, np.repeat(np.arange(cases), 3))
+        np.testing.assert_array_equal(values, np.tile(grid, (cases, 1)))

@@ -3,8 +3,9 @@
 `score` works on one element; `run_elements` is the one place where `vmap` runs over many of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -112,11 +113,32 @@ def element_bytes(length: int, lanes: int, sizes: Sizes, compensating: int) -> f
     return 8.0 * (length * each + lanes * (sizes.samples * _PER_MOVING + sizes.values * _PER_VALUE))
 
 
+class Chunk(NamedTuple):
+    """Elements of one call."""
+
+    which: Int[np.ndarray, "C"]
+    """The case of each."""
+    values: Float[np.ndarray, "C 4"]
+    """Gyroscope rail, accelerometer rail and the two bounds of each."""
+    held: int
+    """So many cases at most are among the elements of any chunk."""
+    real: int
+    """Elements after so many repeat the last one."""
+
+
+def chunks(cases: int, grid: Float[np.ndarray, "E 4"], size: int) -> Iterator[Chunk]:
+    """Every case at each row of rails and bounds, case after case, in chunks of one size."""
+    count = cases * len(grid)
+    # A chunk may begin and end within the rails of a case.
+    held = min(cases, -(-size // len(grid)) + 1)
+    for first in range(0, count, size):
+        at = np.minimum(np.arange(first, first + size), count - 1)
+        yield Chunk(at // len(grid), grid[at % len(grid)], held, min(size, count - first))
+
+
 def run_elements(
     cases: Sequence[Case],
-    which: Int[np.ndarray, "C"],
-    held: int,
-    values: Float[np.ndarray, "C 4"],
+    chunk: Chunk,
     sizes: Sizes,
     options: tuple[Options, ...],
     config: Config,
@@ -124,16 +146,15 @@ def run_elements(
 ) -> dict[str, dict[str, np.ndarray]]:
     """The scores of some elements, by method.
 
-    which, values: the case of each element, and its gyroscope rail, accelerometer rail and two bounds. Their number
-    is a multiple of that of the local devices, among which they are spread. cases: all of like shapes, of which at
-    most `held` are among the elements; calls that agree in it share a program.
+    cases: all of like shapes. The number of elements is a multiple of that of the local devices, among which they are
+    spread; chunks of one size that hold as many cases share a program.
     """
     devices = jax.local_device_count()
     mesh = jax.make_mesh((devices,), ("elements",), (AxisType.Auto,), devices=jax.local_devices())
-    rails, bounds = np.repeat(values[:, :2], 3, axis=1), np.repeat(values[:, 2:], 3, axis=1)
-    used, index = np.unique(which, return_inverse=True)
+    rails, bounds = (np.repeat(part, 3, axis=1) for part in np.split(chunk.values, 2, axis=1))
+    used, index = np.unique(chunk.which, return_inverse=True)
     # Each case travels to the devices once, however many rails it is clipped at.
-    used = np.resize(used, -(-held // devices) * devices)
+    used = np.resize(used, -(-chunk.held // devices) * devices)
     stacked = jax.tree.map(lambda *x: np.stack(x), *(cases[i] for i in used))
     whole, index, rails, bounds = jax.device_put(
         (stacked, index, rails, bounds), NamedSharding(mesh, PartitionSpec("elements"))

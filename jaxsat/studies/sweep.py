@@ -23,7 +23,7 @@ from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording
-from jaxsat.studies.elements import Case, element_bytes, make_case, measured, offset_of, run_elements
+from jaxsat.studies.elements import Case, chunks, element_bytes, make_case, measured, offset_of, run_elements
 
 Progress = Callable[[str, int, int], None]
 """Called with ("sweep", elements done, elements in all)."""
@@ -80,19 +80,13 @@ def sweep(
         total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
         for batch in batches:
             make_room()
-            for indices, values, held, real in _chunks(batch, plan):
+            for chunk in chunks(len(batch.cases), plan.grid, _chunk_size(batch, plan)):
                 scores = run_elements(
-                    batch.cases,
-                    indices,
-                    held,
-                    values,
-                    batch.sizes,
-                    options,
-                    plan.config,
-                    "standard" in plan.methods,
+                    batch.cases, chunk, batch.sizes, options, plan.config, "standard" in plan.methods
                 )
-                rows += _rows(scores, [batch.names[i] for i in indices[:real]], values, plan.methods)
-                done += real
+                names = [batch.names[i] for i in chunk.which[: chunk.real]]
+                rows += _rows(scores, names, chunk.values, plan.methods)
+                done += chunk.real
                 if progress:
                     progress("sweep", done, total)
     place = {name: i for i, name in enumerate(loaders)}
@@ -219,25 +213,14 @@ def _clipped_most(prepared: Prepared, lowest: Float[np.ndarray, "6"], name: str)
     return np.where(clipped, 1, np.asarray(prepared.trial.sign))
 
 
-def _chunks(
-    batch: _Batch, plan: _Plan
-) -> Iterator[tuple[Int[np.ndarray, "C"], Float[np.ndarray, "C 4"], int, int]]:
-    """Elements, trial after trial, in chunks of one size, of how many trials at most, and how many are real.
-
-    The last element is repeated. A chunk holds as many elements for every local device.
-    """
-    case, grid = batch.cases[0], plan.grid
+def _chunk_size(batch: _Batch, plan: _Plan) -> int:
+    """How many elements run at once: as many on every local device, and no more than the memory holds."""
+    case, devices = batch.cases[0], jax.local_device_count()
     compensating = sum(method != "standard" for method in plan.methods)
     each = element_bytes(len(case.trial.signal), len(case.departure), batch.sizes, compensating)
-    count = len(batch.cases) * len(grid)
-    devices = jax.local_device_count()
     memory = plan.memory / (devices if jax.default_backend() == "cpu" else 1)
-    size = devices * int(max(1.0, min(memory / each, -(-count // devices))))
-    # A chunk may begin and end within the rails of a trial.
-    held = min(len(batch.cases), -(-size // len(grid)) + 1)
-    for first in range(0, count, size):
-        at = np.minimum(np.arange(first, first + size), count - 1)
-        yield at // len(grid), grid[at % len(grid)], held, min(size, count - first)
+    count = len(batch.cases) * len(plan.grid)
+    return devices * int(max(1.0, min(memory / each, -(-count // devices))))
 
 
 def _rows(

@@ -18,7 +18,7 @@ from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording
-from jaxsat.studies.elements import Case, make_case, run_elements
+from jaxsat.studies.elements import Case, chunks, make_case, run_elements
 from jaxsat.studies.motions import MOTIONS, Motion
 from jaxsat.studies.simulate import Sensor, Truth, simulate
 
@@ -133,19 +133,15 @@ def score(trials: Elements, values: Float[np.ndarray, "E 4"], chunk: int) -> pd.
     start to stop (m), that of the filled values, and how the search ended; and its ratios to the standard smoother.
     """
     options = tuple(search_options(trials.config, method) for method in METHODS)
-    count, parts = len(trials.cases) * len(values), []
-    for first in range(0, count, chunk):
-        at = np.minimum(np.arange(first, first + chunk), count - 1)
-        rows, held = values[at % len(values)], min(len(trials.cases), -(-chunk // len(values)) + 1)
-        found = run_elements(
-            trials.cases, at // len(values), held, rows, trials.sizes, options, trials.config, standard=True
-        )
-        real = slice(0, min(chunk, count - first))
+    parts = []
+    for some in chunks(len(trials.cases), values, chunk):
+        found = run_elements(trials.cases, some, trials.sizes, options, trials.config, standard=True)
+        real = slice(0, some.real)
         for method, columns in found.items():
             part = pd.DataFrame({name: column[real] for name, column in columns.items()})
-            part.insert(0, "seed", (at // len(values))[real])
+            part.insert(0, "seed", some.which[real])
             part.insert(1, "method", method)
-            part[list(SWEPT)] = rows[real]
+            part[list(SWEPT)] = some.values[real]
             parts.append(part)
     table = pd.concat(parts, ignore_index=True)
     reach = np.sqrt((table[["end_x", "end_y", "end_z"]] ** 2).sum(axis=1))
