@@ -17,7 +17,7 @@ from jaxsat.preparation import LATEST_FIRST_REST
 from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table
 from jaxsat.saturation import compensate
-from jaxsat.saturation.compensate import signal_prior
+from jaxsat.saturation.compensate import ENTRIES, LANES, signal_prior, solved_together
 from jaxsat.signals.readers import read
 from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
 from jaxsat.studies.motions import Bar, Walk
@@ -93,8 +93,10 @@ def test_the_path_of_map_takes_filled_rates_as_measured_and_its_covariance_does_
     np.testing.assert_allclose(found.trajectory.position, plain.trajectory.position, atol=1e-9)
     np.testing.assert_allclose(found.trajectory.q_nb, plain.trajectory.q_nb, atol=1e-9)
     sure, unsure = (np.diagonal(x.trajectory.covariance, axis1=1, axis2=2) for x in (plain, found))
-    # Linearised about paths that differ by a little.
-    assert (unsure >= sure * (1 - 1e-4)).all() and (unsure.max(axis=0) > 1.01 * sure.max(axis=0)).any()
+    # Linearised about paths that differ by a little: rates that are free take up what the mean of δ, unlike its mode,
+    # leaves of the rests. It shows where nothing was lost, in the velocity out of the plane.
+    least = np.where(np.arange(9) == 7, 1e-3, 1e-4)
+    assert (unsure >= sure * (1 - least)).all() and (unsure.max(axis=0) > 1.01 * sure.max(axis=0)).any()
 
 
 def test_a_path_is_free_where_the_bound_holds_a_rate():
@@ -339,3 +341,20 @@ def test_what_is_learned_of_the_sensors_is_said():
     assert (np.abs(said["lever"]) < 4 * np.array(said["lever_sd"])).all()
     errors = [position_rmse(x.trajectory.position, truth.position) for x in (found, blind)]
     assert errors[0] < errors[1]
+
+
+def test_long_segments_are_solved_fewer_at_a_time():
+    """Matrices of values by values keep to a size; each segment that saturates is solved once, likes together."""
+    rng = np.random.default_rng(0)
+    values = np.concatenate(
+        [np.zeros(9, int), rng.integers(1, 40, size=150), rng.integers(900, 3000, size=7)]
+    )
+    samples = 3 * values + 5
+    chunks = list(solved_together(samples, values))
+    solved = np.concatenate([mine for mine, _ in chunks])
+    assert sorted(solved) == list(np.flatnonzero(values)) and (np.diff(values[solved]) >= 0).all()
+    assert max(len(mine) for mine, _ in chunks) == LANES
+    for mine, sizes in chunks:
+        assert values[mine].max() <= sizes.values and samples[mine].max() <= sizes.samples
+        assert len(mine) == 1 or len(mine) * sizes.values**2 <= ENTRIES
+    assert len(chunks[-1][0]) < 7

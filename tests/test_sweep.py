@@ -59,7 +59,7 @@ DEVICES = jax.local_device_count()
 
 def chunk_of(count: int) -> float:
     """A budget of so many elements a device (bytes)."""
-    return (count + 0.5) * elements.element_bytes(256, 1, Sizes(256, 64), 1)
+    return (count + 0.5) * elements.element_bytes(256, 1, Sizes(256, 64), ["direct"])
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import problems
 import pytest
 from scipy.linalg import eigh
-from scipy.stats import norm, truncnorm
+from scipy.stats import norm
 from test_pipeline import BAR, bar
 from test_segment import DELTA, build
 
@@ -19,9 +19,11 @@ from jaxsat.present.tables import gaps_table, segments_table
 from jaxsat.saturation.arrival import own_misfit
 from jaxsat.saturation.prior import Known
 from jaxsat.saturation.segment import condense, value_and_root, value_gradient_root
-from jaxsat.saturation.uncertainty import CREDIT, LEAST_HEARD, LEAST_SEEN, truncated_deviation, uncertainty
+from jaxsat.saturation.truncated import truncated_moments
+from jaxsat.saturation.uncertainty import CREDIT, LEAST_HEARD, LEAST_SEEN, uncertainty
 
 COLUMNS, JUDGE = jax.jit(value_gradient_root), jax.jit(uncertainty)
+MOMENTS = jax.jit(truncated_moments)
 
 
 @jax.jit
@@ -50,7 +52,6 @@ def known_segment(scale: float):
         expected=jnp.zeros(8),
         alone=jnp.zeros(8),
         variance=jnp.diagonal(covariance),
-        rough=jnp.ones(8),
         harmful=jnp.zeros(8, bool),
     )
     segment = build(False)
@@ -58,46 +59,36 @@ def known_segment(scale: float):
     return eqx.tree_at(lambda s: (s.known, s.gap), segment, (prior, gaps), is_leaf=lambda x: x is None)
 
 
-def deviation(centre, sd, upper, about):
-    """Root mean square about a value under a Gaussian cut off below 0 and above `upper`, by scipy."""
-    sd = np.maximum(sd, np.maximum(-centre, centre - upper))
-    cut = truncnorm(-centre / sd, (upper - centre) / sd, centre, sd)
-    return np.sqrt(cut.var() + (cut.mean() - about) ** 2)
+def within(segment, precision, pull):
+    """Moments within the limits of the six values."""
+    given = precision, pull, np.asarray(segment.bound)[:6], np.ones(6, bool)
+    return map(np.asarray, MOMENTS(*map(jnp.asarray, given)))
 
 
-def test_deviation_of_a_truncated_gaussian_is_that_of_scipy():
-    """Within the limits, a little and far beyond them, and so wide that only they count."""
-    centre = np.array([0.5, -0.5, -30.0, 3.2, 40.0, 0.1])
-    sd, upper, about = (
-        np.array([0.2, 0.7, 1.0, 0.5, 0.5, 50.0]),
-        3.0,
-        np.array([0.5, 0.0, 0.0, 3.0, 3.0, 1.0]),
-    )
-    found = jax.jit(truncated_deviation)(*map(jnp.asarray, (centre, sd, np.full(6, upper), about)))
-    np.testing.assert_allclose(found, deviation(centre, sd, upper, about), rtol=1e-6)
-    # What was put 30 below its rail was off by about as much.
-    assert found[2] > 1.0
+PAIR = np.array([1.0, 1, 0, 0, 0, 0])
+
+
+def about(mean, away, spread):
+    """sd of values, and of the sum of the first two, about a mean that is not their own."""
+    square = spread + np.outer(away - mean, away - mean)
+    return np.sqrt(np.diagonal(square)), np.sqrt(PAIR @ square @ PAIR)
 
 
 def dense(segment, factor=1.0):
-    """Of the first gap's two values and their sum, by dense algebra: covariances before and after, deviations.
+    """By dense algebra: variance of the first gap's sum before and after, mean and sd of values, sd of that sum.
 
-    Away from a mode the slope is large, and a centre that is found from it agrees to five digits only.
+    Away from a mode the slope is large, and what it pushes to a limit agrees to five digits only.
     """
     # A is compared with derivatives of the strapdown in test_segment.
     _, slope, columns = COLUMNS(DELTA, condense(segment), problems.GRAVITY)
     A = np.stack(columns, axis=1)[:6]
     precision = np.asarray(segment.known.precision)[:6, :6]
-    delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
-    pull = np.asarray(slope)[:6] + precision @ delta
+    pull = A @ (A.T @ np.asarray(DELTA)[:6]) - np.asarray(slope)[:6]
     before, after = np.linalg.inv(precision), np.linalg.inv(precision + A @ A.T / factor)
-    centre = delta - np.linalg.solve(precision + A @ A.T, pull)
-    sd = np.sqrt(np.diagonal(after))
-    wide = np.maximum(1.0, np.maximum(-centre, centre - bound) / sd)
-    pair = np.array([1.0, 1, 0, 0, 0, 0])
-    of_sum = np.sqrt(pair @ (np.outer(wide, wide) * after) @ pair)
-    of_sum = deviation(pair @ centre, of_sum, pair @ bound, pair @ delta)
-    return pair @ before @ pair, pair @ after @ pair, deviation(centre, sd, bound, delta), of_sum
+    mean, _ = within(segment, precision + A @ A.T, pull)
+    mean = np.clip(mean, 0.0, np.asarray(segment.bound)[:6])
+    away, spread = within(segment, precision + A @ A.T / factor, pull / factor)
+    return PAIR @ before @ PAIR, PAIR @ after @ PAIR, mean, *about(mean, away, spread)
 
 
 def rank(segment):
@@ -112,7 +103,8 @@ def rank(segment):
 def test_a_gap_is_known_as_well_as_its_dense_posterior_says():
     segment = known_segment(1e-2)
     found = judge(segment, DELTA)
-    before, after, sd, of_sum = dense(segment)
+    before, after, mean, sd, of_sum = dense(segment)
+    np.testing.assert_allclose(found.mean[:6], mean, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(found.sd[:6], sd, rtol=1e-4)
     np.testing.assert_allclose(found.gap_sd[:2], of_sum, rtol=1e-4)
     assert found.identified[0] == found.identified[1] == pytest.approx(1.0 - after / before, abs=1e-9)
@@ -125,7 +117,7 @@ def test_what_the_rests_say_is_the_posterior_without_the_prior():
     expected = jnp.where(jnp.arange(8) < 2, 0.3, 0.0)
     segment = eqx.tree_at(lambda s: s.known.expected, known_segment(1e-2), expected)
     found = judge(segment, DELTA)
-    before, after, _, _ = dense(segment)
+    before, after, *_ = dense(segment)
     assert 1.0 - after / before > LEAST_HEARD
     variance = 1.0 / (1.0 / after - 1.0 / before)
     assert found.heard.variance[0] == pytest.approx(variance, rel=1e-6)
@@ -145,7 +137,9 @@ def test_data_that_leave_much_unexplained_are_believed_less():
     np.testing.assert_array_equal(judge(segment, DELTA, 0.5 * free).gap_sd, alike.gap_sd)
     for factor in (2.0, 5.0):
         found = judge(segment, DELTA, 0.5 * (factor * (free + CREDIT) - CREDIT))
-        before, after, sd, of_sum = dense(segment, factor)
+        before, after, mean, sd, of_sum = dense(segment, factor)
+        # What is filled in does not change.
+        np.testing.assert_allclose(found.mean[:6], mean, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(found.sd[:6], sd, rtol=1e-4)
         np.testing.assert_allclose(found.gap_sd[0], of_sum, rtol=1e-4)
         assert found.identified[0] == pytest.approx(1.0 - after / before, abs=1e-9)
@@ -166,36 +160,30 @@ def test_what_a_rest_costs_by_itself_is_the_least_over_all_arrivals():
 
 
 def test_hidden_peaks_that_were_far_off_widen_what_is_known():
-    """A prior of twice the sd, as if δ had been its mode."""
-    segment = known_segment(1.0)
-    doubted = eqx.tree_at(lambda s: s.known.believed, segment, 4.0 * segment.known.covariance)
-    slope, nothing = jnp.zeros(8), 6 * (jnp.zeros(8),)
-    known, plain = (JUDGE(s, DELTA, jnp.zeros(()), slope, nothing, nothing) for s in (doubted, segment))
-    covariance = np.asarray(segment.known.covariance)[:6, :6]
-    delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
-    for found, times in ((plain, 1.0), (known, 2.0)):
-        sd = times * np.sqrt(np.diagonal(covariance))
-        np.testing.assert_allclose(found.sd[:6], deviation(delta, sd, bound, delta), rtol=1e-6)
-    assert (np.asarray(known.sd)[:6] > np.asarray(plain.sd)[:6]).all()
+    """A prior about δ of one and of twice the sd, and no data."""
+    plain, delta = known_segment(1.0), np.asarray(DELTA)[:6]
+    plain = eqx.tree_at(lambda s: s.known.slope, plain, -plain.known.precision @ DELTA)
+    doubted = eqx.tree_at(lambda s: s.known.believed, plain, 4.0 * plain.known.covariance)
+    nothing = 6 * (jnp.zeros(8),)
+    sd = []
+    for segment, times in ((plain, 1.0), (doubted, 2.0)):
+        found = JUDGE(segment, DELTA, jnp.zeros(()), jnp.zeros(8), nothing, nothing)
+        precision = np.asarray(segment.known.precision)[:6, :6] / times**2
+        mean, spread = within(segment, precision, precision @ delta)
+        np.testing.assert_allclose(found.mean[:6], mean, rtol=1e-6)
+        np.testing.assert_allclose(found.sd[:6], about(mean, mean, spread)[0], rtol=1e-6)
+        sd.append(found.sd[:6])
+    assert (sd[1] > sd[0]).all()
 
 
-def test_values_of_a_rough_gap_are_known_less_well_but_not_their_sum():
-    """What the sum says of each value stays; the rest of its variance is scaled."""
+def test_what_is_not_filled_stays_as_it_is():
+    """Neither does it limit the others, which then may be anything beside it."""
     segment = known_segment(1.0)
-    rough = eqx.tree_at(lambda s: s.known.rough, segment, jnp.full(8, 9.0))
-    slope, nothing = jnp.zeros(8), 6 * (jnp.zeros(8),)
-    plain, found = (JUDGE(s, DELTA, jnp.zeros(()), slope, nothing, nothing) for s in (segment, rough))
-    covariance, pair = np.asarray(segment.known.covariance)[:6, :6], np.ix_([0, 1], [0, 1])
-    row = covariance[pair].sum(axis=1)
-    summed = row**2 / row.sum()
-    # The other gaps have one value, which is its own sum.
-    variance = np.diagonal(covariance).copy()
-    variance[:2] = summed + 9.0 * (variance[:2] - summed)
-    delta, bound = np.asarray(DELTA)[:6], np.asarray(segment.bound)[:6]
-    np.testing.assert_allclose(found.sd[:6], deviation(delta, np.sqrt(variance), bound, delta), rtol=1e-6)
-    assert (np.asarray(found.sd)[:2] > 1.1 * np.asarray(plain.sd)[:2]).all()
-    for name in ("gap_sd", "identified", "arrival", "asked"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))
+    harmful = eqx.tree_at(lambda s: s.known.harmful, segment, jnp.arange(8) == 2)
+    delta = DELTA.at[2].set(0.0)
+    found = judge(harmful, delta)
+    assert found.mean[2] == 0.0 and found.sd[2] == pytest.approx(float(jnp.sqrt(segment.known.variance[2])))
+    assert (np.asarray(found.mean)[[0, 1, 3, 4, 5]] > 0.0).all()
 
 
 def test_without_a_rest_the_prior_decides():

@@ -25,6 +25,11 @@ def one_by_one(function: Callable) -> Callable:
 _solve_positive = one_by_one(
     lambda matrix, right: jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right)
 )
+_inverse_root = one_by_one(
+    lambda matrix: jax.scipy.linalg.solve_triangular(
+        jnp.linalg.cholesky(matrix), jnp.eye(len(matrix), dtype=matrix.dtype), lower=True
+    )
+)
 _eigh = one_by_one(lambda matrix: tuple(jnp.linalg.eigh(matrix)))
 
 
@@ -42,9 +47,15 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
     return _solve_positive(matrix, right)
 
 
+def inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """W, lower triangular, with WᵀW the inverse of a positive definite matrix."""
+    return _inverse_root(matrix)
+
+
 def inverse_positive(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse of a positive definite matrix."""
-    return _solve_positive(matrix, jnp.eye(len(matrix), dtype=matrix.dtype))
+    root = inverse_root(matrix)
+    return root.T @ root
 
 
 def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:

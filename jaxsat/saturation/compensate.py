@@ -35,6 +35,8 @@ Progress = Callable[[int, int], None]
 
 # So many segments are solved at once; more would gain nothing on a CPU and wait for the slowest.
 LANES = 64
+# `map` holds some matrices of values × values for each: of all together one has no more entries than of 64 × 512².
+ENTRIES = LANES * 512**2
 # Gauss-Newton steps from no calibration: a third changes no digit that is reported.
 FIRST_STEPS = 2
 
@@ -235,7 +237,7 @@ def compensate_parallel(
     """
     fills = Fills.nothing(trial, len(segments))
     prior = _prior(trial) if options.method == "map" else None
-    chunks = list(_chunks(*count_values(trial.sign, segments)))
+    chunks = list(solved_together(*count_values(trial.sign, segments)))
     total, done = sum(len(mine) for mine, _ in chunks), 0
     for _ in range(sweeps):
         here = trial.calibrated(calibration)
@@ -264,14 +266,16 @@ def recalibrated(trial: Trial, fills: Fills, options: Options, calibration: Cali
     return calibrate_recording(trial, fills.signal, fills.variance, options.calibration_sd, calibration)
 
 
-def _chunks(
+def solved_together(
     samples: Int[np.ndarray, "S"], values: Int[np.ndarray, "S"]
 ) -> Iterator[tuple[Int[np.ndarray, "L"], Sizes]]:
     """Segments that saturate, those of like size together; a short recording is one chunk, so one program."""
     busy = np.flatnonzero(values)
     busy = busy[np.lexsort((samples[busy], values[busy]))]
-    for first in range(0, len(busy), LANES):
-        mine = busy[first : first + LANES]
+    while len(busy):
+        longest = int(values[busy[:LANES]].max())
+        lanes = min(LANES, max(1, ENTRIES // padded_sizes(1, longest).values ** 2))
+        mine, busy = busy[:lanes], busy[lanes:]
         yield mine, padded_sizes(int(samples[mine].max()), int(values[mine].max()))
 
 

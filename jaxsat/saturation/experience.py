@@ -69,7 +69,8 @@ def experienced(
 
     heard: [N, 6] each; factor: by what each motion asks for the variance of its data to be scaled, NaN where nothing
     was searched. Rates are random effects: what their differences exceed their own variances is their spread
-    (DerSimonian and Laird 1986, Controlled Clinical Trials 7).
+    (DerSimonian and Laird 1986, Controlled Clinical Trials 7). Noise is asked for once: what experience and rests
+    disagree on later would be taken for more of it again and again.
     """
     steps, (begins, ends) = jnp.arange(len(sign))[:, None], gap_ends(sign)
     last = jax.lax.cummin(jnp.where(ends, steps, len(sign)), reverse=True)
@@ -104,7 +105,7 @@ def experienced(
         mean=mean,
         spread=spread + over(jnp.sign(total(weight)), total(weight)),
         miss=jnp.maximum(over(total(weight * missed), total(weight)), 0.0),
-        noise=jnp.maximum(before.noise * jnp.where(jnp.isnan(asked), 1.0, asked), 1.0),
+        noise=jnp.where(before.noise > 1.0, before.noise, jnp.fmax(asked, 1.0)),
     )
 
 

@@ -171,17 +171,17 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
     slack = variance
     if known is not None:
         slack = jnp.where((segment.channel < 3) & ~known.harmful & ~at_bound, 0.0, variance)
+    said = None
+    if known is not None:
+        effect = tuple(e[1] for e in effects)
+        said = uncertainty(segment, delta, solution.value, solution.gradient, solution.columns, effect)
     return SegmentFill(
-        delta=delta,
+        delta=delta if said is None else jnp.where(keep, delta, said.mean),
         cost_before=before,
         solution=solution,
         variance=variance,
         slack=slack,
         at_bound=at_bound,
-        uncertainty=None
-        if known is None
-        else uncertainty(
-            segment, delta, solution.value, solution.gradient, solution.columns, tuple(e[1] for e in effects)
-        ),
+        uncertainty=said,
         inflated=jnp.zeros_like(real) if known is None else known.harmful,
     )

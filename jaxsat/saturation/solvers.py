@@ -161,6 +161,8 @@ def _solution(box: Box, u, at, count, stalled) -> Solution:
 # directions that the data do not see, the rounding of the gradient over the damping is a step: with the least at 1e-6
 # it moved filled values by 1e-4 rad/s, with 1e-2 by 1e-9, for the same number of steps.
 _DAMPING = (1.0, 1e-2, 1e6)
+# The least with a prior.
+_UNDAMPED = 1e-9
 
 
 def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
@@ -175,8 +177,9 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
     least = jnp.minimum(least, box.tolerance)
     known = None if box.precision is None else box.precision * box.scale[:, None] * box.scale[None]
     if known is not None:
-        # The prior tells apart what the data do not, so a full step may be tried at once.
-        first = least
+        # The prior tells apart what the data do not, so full steps may be tried at once, and nothing need be damped:
+        # smooth movement has directions of very little curvature.
+        first = least = jnp.minimum(least, _UNDAMPED)
     linearise = jax.jit(linearise)  # so that it is traced once
     rank = len(jax.eval_shape(linearise, box.start)[2])
 

@@ -1,8 +1,8 @@
 """How well filled values are known: the posterior of δ where a signal prior and the rests meet.
 
 About its mode the posterior is Gaussian with precision Ω + A Aᵀ: that of the prior, and that of the data in six
-directions (attitude and velocity on arrival). A value lies beyond its rail and within its bound, so its own
-distribution is that Gaussian's marginal, cut off there; an sd is about the value reported, the mode.
+directions (attitude and velocity on arrival). Each value lies beyond its rail and within its bound: what is reported
+is the mean of that Gaussian cut off there (`jaxsat.saturation.truncated`), and the sd about it.
 
 The noise of the data is that of the sensor; what scale errors of the sensor, its mounting or a foot that rolls do to
 attitude and velocity on arrival is not in it. It shows in what the data leave unexplained at the mode, and their
@@ -12,14 +12,15 @@ evidence).
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Int
 
-from jaxsat.inertial.dense import eigh, solve_positive
+from jaxsat.inertial.dense import eigh, inverse_positive, solve_positive
 from jaxsat.saturation.arrival import own_misfit
 from jaxsat.saturation.experience import Heard
 from jaxsat.saturation.segment import Segment
+from jaxsat.saturation.truncated import truncated_moments
 
 # As if in so many directions more as much had been left as expected: one motion alone says little about its scale.
 CREDIT = 3.0
@@ -32,6 +33,8 @@ LEAST_HEARD = 0.5
 class Uncertainty(eqx.Module):
     """Of the filled values of one segment; zeros where a value is padded."""
 
+    mean: Float[Array, "m"]
+    """Of δ, within its limits; where a gap is not to be filled, δ as it is."""
     sd: Float[Array, "m"]
     """Of each value (its unit)."""
     gap_sd: Float[Array, "m"]
@@ -79,7 +82,6 @@ def uncertainty(
     seen = known.covariance @ A
     strength = A.T @ seen
     held = variance(known.covariance - seen @ solve_positive(one + strength, seen.T))
-    centre = delta - known.covariance @ slope + seen @ solve_positive(one + strength, seen.T @ slope)
     free = jnp.trace(solve_positive(one + strength, one))
 
     left = value - delta @ (known.slope + 0.5 * known.precision @ delta) - own_misfit(segment.arrival)
@@ -108,16 +110,23 @@ def uncertainty(
     strengths, _ = eigh(A.T @ seen / factor)
     moved = jnp.stack(effects, axis=1)
     removed = jnp.einsum("ik,ij,jk->k", moved, before - after, moved)
-    sd = jnp.sqrt(jnp.maximum(jnp.diagonal(after), 1e-300))
-    # Rests tell of sums. Within a gap it is the prior that claims, as if innovations were alike in all gaps.
-    row, of_sums = jnp.sum(jnp.where(together, after, 0.0), axis=1), variance(after)
-    summed = jnp.where(of_sums > 0.0, row**2 / jnp.where(of_sums > 0.0, of_sums, 1.0), 0.0)
-    sd_here = jnp.sqrt(jnp.maximum(summed + known.rough * (sd**2 - summed), 1e-300))
-    wider = widened(centre, sd, segment.bound) / sd
-    gap_sd = jnp.sqrt(jnp.maximum(variance(after * wider[:, None] * wider[None]), 1e-300))
-    of_value = truncated_deviation(centre, sd_here, segment.bound, delta)
-    of_sum = truncated_deviation(of_gap(centre), gap_sd, of_gap(segment.bound), of_gap(delta))
+    filled = real & ~known.harmful
+    # What the data say is a quadratic form about the mode.
+    data = A @ (A.T @ delta) - slope + known.precision @ delta + known.slope
+    certain = inverse_positive(before)
+
+    def posterior(factor):
+        pull = data / factor - certain @ (known.covariance @ known.slope)
+        return truncated_moments(certain + A @ A.T / factor, pull, segment.bound, filled)
+
+    # δ does without the factor: sums of gaps were further from the truth with it.
+    (mean, away), (_, spread) = jax.lax.map(posterior, jnp.stack([1.0, factor]))
+    mean = jnp.where(filled, jnp.clip(mean, 0.0, segment.bound), delta)
+    away = jnp.where(filled, away - mean, 0.0)
+    of_value = jnp.sqrt(jnp.diagonal(spread) + away**2)
+    of_sum = jnp.sqrt(variance(spread) + of_gap(away) ** 2)
     return Uncertainty(
+        mean=mean,
         sd=jnp.where(real, jnp.where(known.harmful, jnp.sqrt(known.variance), of_value), 0.0),
         gap_sd=jnp.where(real, of_sum, 0.0),
         identified=jnp.where(real, share, 0.0),
@@ -126,24 +135,3 @@ def uncertainty(
         rank=jnp.sum(strengths > LEAST_SEEN),
         arrival=jnp.sqrt(jnp.maximum(removed, 0.0)),
     )
-
-
-def widened(centre: Float[Array, "m"], sd: Float[Array, "m"], upper: Float[Array, "m"]) -> Float[Array, "m"]:
-    """sd of Gaussians that are cut off below 0 and above `upper`, at least as large as the centre lies beyond either.
-
-    That the sensor saturated is an observation too: a Gaussian that puts a value below the rail was off by as much.
-    """
-    return jnp.maximum(sd, jnp.maximum(-centre, centre - upper))
-
-
-def truncated_deviation(
-    centre: Float[Array, "m"], sd: Float[Array, "m"], upper: Float[Array, "m"], about: Float[Array, "m"]
-) -> Float[Array, "m"]:
-    """Root mean square deviation from `about` under Gaussians, `widened`, cut off below 0 and above `upper`."""
-    sd = widened(centre, sd, upper)
-    low, high = -centre / sd, (upper - centre) / sd
-    inside = jnp.maximum(norm.cdf(high) - norm.cdf(low), 1e-300)
-    at_low, at_high = norm.pdf(low) / inside, norm.pdf(high) / inside
-    mean, square = at_low - at_high, 1.0 + low * at_low - high * at_high
-    away = (centre - about) / sd
-    return sd * jnp.sqrt(jnp.maximum(square + away * (2.0 * mean + away), 0.0))

@@ -39,6 +39,8 @@ from jaxsat.signals.recording import sensor_changes
 # padded sample of a segment, and each of its padded saturated values; fitted to what XLA reports on a CPU for its
 # arguments, results and temporary arrays.
 _PER_SAMPLE, _PER_METHOD, _PER_MOVING, _PER_VALUE = 450, 200, 75, 110
+# And of `map`, for each sample and each pair of such values.
+_PER_LEARNED, _PER_PAIR = 1000, 10
 
 # How a search can end, from best to worst.
 _SEVERITY = (
@@ -103,14 +105,17 @@ def measured(trial: Trial) -> Bool[Arrays, "N 6"]:
     return trial.clean | (trial.sign != 0)
 
 
-def element_bytes(length: int, lanes: int, sizes: Sizes, compensating: int) -> float:
+def element_bytes(length: int, lanes: int, sizes: Sizes, methods: Sequence[str]) -> float:
     """About what the arrays of one element take, at most.
 
-    length: padded samples of the trial; lanes: segments, of the padded lengths `sizes`; compensating: how many
-    methods other than `standard` there are.
+    length: padded samples of the trial; lanes: segments, of the padded lengths `sizes`.
     """
+    compensating = sum(method != "standard" for method in methods)
     each = _PER_SAMPLE + _PER_METHOD * max(0, compensating - 1)
-    return 8.0 * (length * each + lanes * (sizes.samples * _PER_MOVING + sizes.values * _PER_VALUE))
+    of_lane = sizes.samples * _PER_MOVING + sizes.values * _PER_VALUE
+    if "map" in methods:
+        each, of_lane = each + _PER_LEARNED, of_lane + _PER_PAIR * sizes.values**2
+    return 8.0 * (length * each + lanes * of_lane)
 
 
 class Chunk(NamedTuple):

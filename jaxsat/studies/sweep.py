@@ -216,8 +216,7 @@ def _clipped_most(prepared: Prepared, lowest: Float[np.ndarray, "6"], name: str)
 def _chunk_size(batch: _Batch, plan: _Plan) -> int:
     """How many elements run at once: as many on every local device, and no more than the memory holds."""
     case, devices = batch.cases[0], jax.local_device_count()
-    compensating = sum(method != "standard" for method in plan.methods)
-    each = element_bytes(len(case.trial.signal), len(case.departure), batch.sizes, compensating)
+    each = element_bytes(len(case.trial.signal), len(case.departure), batch.sizes, plan.methods)
     memory = plan.memory / (devices if jax.default_backend() == "cpu" else 1)
     count = len(batch.cases) * len(plan.grid)
     return devices * int(max(1.0, min(memory / each, -(-count // devices))))
