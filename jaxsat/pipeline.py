@@ -17,9 +17,11 @@ from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import computing, stored_jit
 from jaxsat.inertial.smoother import (
     ActiveSet,
+    Rows,
     Smoothed,
     displacement_covariance,
     smooth,
+    smooth_about,
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
@@ -168,11 +170,10 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
                 for extra in (fills.slack, fills.variance)
             )
-            # How sure the path is, is another question.
-            doubted = beside.submit(smooth_beside, sure) if (fills.slack != fills.variance).any() else None
             compensated = _smooth(path, config)
-            if doubted is not None:
-                covariance = doubted.result()[0].covariance
+            # How sure the path is, is another question.
+            if (fills.slack != fills.variance).any():
+                covariance = _covariance_of(*compensated, sure)
                 compensated = eqx.tree_at(lambda s: s[0].covariance, compensated, covariance)
         standard, floor = ignoring.result()
         smoothed, floor = compensated or (standard, floor)
@@ -283,6 +284,23 @@ def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:
             config.height.mode == "nonnegative",
         )
         return jax.block_until_ready(smoothed), floor
+
+
+def _covariance_of(path: Smoothed, floor: ActiveSet | None, trial: Trial) -> Float[Array, "N 9 9"]:
+    """Of a path by the noise of `trial`; rests that touch the floor still do."""
+    touching = None if floor is None else floor.active
+    with computing():
+        given = path.state, trial.signal, trial.period, trial.variance, trial.rows, touching
+        return jax.block_until_ready(_about(*given, trial.prior, trial.prior_covariance, trial.gravity))
+
+
+@stored_jit
+def _about(state, signal, period, variance, rows, touching, prior, prior_covariance, gravity):
+    if touching is not None:
+        exact = jnp.zeros_like(rows.height_variance)
+        rows = Rows(rows.rest, rows.velocity_variance, touching, exact, rows.velocity)
+    samples = Samples(signal, period, variance)
+    return smooth_about(state, samples, rows, prior, prior_covariance, gravity).covariance
 
 
 @stored_jit
