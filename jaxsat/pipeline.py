@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import cast
 
@@ -14,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
 from jaxsat.inertial.calibration import Calibration
-from jaxsat.inertial.programs import computing, stored_jit
+from jaxsat.inertial.programs import Beside, computing, stored_jit
 from jaxsat.inertial.smoother import (
     ActiveSet,
     Rows,
@@ -32,6 +31,7 @@ from jaxsat.saturation.compensate import (
     calibrate_recording,
     compensate_parallel,
     compensate_sequential,
+    prepare_search,
 )
 from jaxsat.saturation.layout import Trial, bucket, pad
 from jaxsat.saturation.methods import Compensation, Options
@@ -141,25 +141,22 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))
     searched = without_floor(trial, config)
-    calibration = calibrate_by_rests(searched, config)
-    clock.lap("calibration")
-    sure = trial.calibrated(calibration)
-    device = jax.config.jax_default_device  # type: ignore[attr-defined]
-
-    def smooth_beside(trial: Trial):
-        # A device that is chosen for a while is a thread's own setting, too.
-        with jax.default_device(device):
-            return _smooth(trial, config)
-
+    together = config.saturation.segments == "parallel"
+    options = None
+    if config.method != "standard" and len(gaps):
+        options = search_options(config, config.method)
     # What the search does not wait for goes on beside it.
-    with ThreadPoolExecutor(1) as beside:
-        ignoring = beside.submit(smooth_beside, sure)
+    with Beside(2) as beside:
+        preparing = options and beside.submit(prepare_search, searched, segments, options, together=together)
+        calibration = calibrate_by_rests(searched, config)
+        clock.lap("calibration")
+        sure = trial.calibrated(calibration)
+        ignoring = beside.submit(_smooth, sure, config)
         compensated = None
-        if config.method != "standard" and len(gaps):
-            options = search_options(config, config.method)
+        if preparing:
             report = partial(progress, "segments")
-            given = searched, segments, options, calibration
-            if config.saturation.segments == "parallel":
+            given = searched, segments, options, calibration, preparing.result
+            if together:
                 passes = config.saturation.passes(config.method)
                 fills, calibration = compensate_parallel(*given, passes, report)
             else:
@@ -270,28 +267,25 @@ class _Clock:
 
 
 def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:
-    # JAX's precision is a thread's own setting.
-    with computing():
-        smoothed, floor = _whole_trial(
-            trial.signal,
-            trial.period,
-            trial.variance,
-            trial.rows,
-            trial.prior,
-            trial.prior_covariance,
-            trial.gravity,
-            np.asarray(config.smoother.relinearisations),
-            config.height.mode == "nonnegative",
-        )
-        return jax.block_until_ready(smoothed), floor
+    smoothed, floor = _whole_trial(
+        trial.signal,
+        trial.period,
+        trial.variance,
+        trial.rows,
+        trial.prior,
+        trial.prior_covariance,
+        trial.gravity,
+        np.asarray(config.smoother.relinearisations),
+        config.height.mode == "nonnegative",
+    )
+    return jax.block_until_ready(smoothed), floor
 
 
 def _covariance_of(path: Smoothed, floor: ActiveSet | None, trial: Trial) -> Float[Array, "N 9 9"]:
     """Of a path by the noise of `trial`; rests that touch the floor still do."""
     touching = None if floor is None else floor.active
-    with computing():
-        given = path.state, trial.signal, trial.period, trial.variance, trial.rows, touching
-        return jax.block_until_ready(_about(*given, trial.prior, trial.prior_covariance, trial.gravity))
+    given = path.state, trial.signal, trial.period, trial.variance, trial.rows, touching
+    return jax.block_until_ready(_about(*given, trial.prior, trial.prior_covariance, trial.gravity))
 
 
 @stored_jit

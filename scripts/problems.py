@@ -11,7 +11,7 @@ from peers import shortest
 from peers.strapdown import bare_trials, numba_strapdown
 
 from jaxsat import Sensor, load_config, simulate
-from jaxsat.inertial.programs import compiled, computing
+from jaxsat.inertial.programs import Beside, compiled, computing, usable_cores
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import prepare
@@ -99,10 +99,20 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
     )
 
 
-def run_direct(batch: Batch, whole: bool) -> Callable:
+def run_direct(batch: Batch, whole: bool, parts: int = 1) -> Callable:
+    """All trials at once; or so many parts of them, side by side on all cores."""
     solve = compiled(jax.vmap(lambda trial: direct(trial, batch, whole)))
-    trials = jax.device_put(jax.tree.map(jnp.asarray, batch.trials))
-    return lambda: solve(trials)
+    leaves, structure = jax.tree.flatten(batch.trials)
+    split = zip(*(np.array_split(leaf, parts) for leaf in leaves), strict=True)
+    trials = [jax.device_put(jax.tree.map(jnp.asarray, structure.unflatten(part))) for part in split]
+    if parts == 1:
+        return lambda: solve(trials[0])
+
+    def side_by_side():
+        with Beside(usable_cores()) as beside:
+            return list(beside.map(lambda part: jax.block_until_ready(solve(part)), trials))
+
+    return side_by_side
 
 
 @cache

@@ -10,6 +10,7 @@ import pickle
 import platform
 import tempfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache, wraps
 from importlib.metadata import version
@@ -37,7 +38,7 @@ UNOPTIMISED: Options = {**OPTIONS, "xla_backend_optimization_level": 0}
 MOST_MAPS = 0.5
 
 _folder: Path | None = None
-_loaded: dict[str, Callable[..., Any] | None] = {}
+_loaded: dict[str, "_Program | None"] = {}
 
 
 @contextmanager
@@ -49,6 +50,19 @@ def computing() -> Iterator[None]:
     """
     with threadpool_limits(1, "blas"), jax.enable_x64(True):
         yield
+
+
+class Beside(ThreadPoolExecutor):
+    """Threads that compute as the one that submits: device and precision are a thread's own settings."""
+
+    def submit(self, function, /, *args, **kwargs):
+        device, wide = jax.config.jax_default_device, jax.config.jax_enable_x64  # type: ignore[attr-defined]
+
+        def alike():
+            with jax.default_device(device), jax.enable_x64(wide):
+                return function(*args, **kwargs)
+
+        return super().submit(alike)
 
 
 def usable_cores() -> int:
@@ -105,30 +119,49 @@ def stored_jit(function: F, options: Options | None = OPTIONS) -> F:
     inner = options is None
     jitted = function if inner else compiled(function, options)
 
-    @wraps(function)
-    def call(*args):
+    def flat(args):
         arrays, rest = eqx.partition(args, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic))
-        leaves, structure = jax.tree.flatten(arrays)
-        if not inner and any(isinstance(leaf, Tracer) for leaf in leaves):
-            return function(*args)
-        if _folder is None:
-            return jitted(*args)
+        return *jax.tree.flatten(arrays), rest
+
+    def load(folder: Path, leaves, structure, rest) -> _Program | None:
         kinds = [jax.typeof(leaf) for leaf in leaves]
         name = f"{function.__module__}.{function.__qualname__}"
         where = _platform()
         parts = name, _surroundings(), where, jax.config.jax_enable_x64, structure, rest, kinds  # type: ignore[attr-defined]
         key = hashlib.sha256(repr(parts).encode()).hexdigest()
         if key not in _loaded:
-            path = _folder / f"{key}.trace"
+            path = folder / f"{key}.trace"
 
             def whole(*given):
                 return function(*eqx.combine(jax.tree.unflatten(structure, given), rest))
 
             _loaded[key] = _read(path, options) or _trace(whole, kinds, where, path, options)
-        program = _loaded[key]
+        return _loaded[key]
+
+    @wraps(function)
+    def call(*args):
+        leaves, structure, rest = flat(args)
+        if not inner and any(isinstance(leaf, Tracer) for leaf in leaves):
+            return function(*args)
+        program = None if _folder is None else load(_folder, leaves, structure, rest)
         return jitted(*args) if program is None else program(*leaves)
 
+    def ahead(*args):
+        leaves, structure, rest = flat(args)
+        program = None if _folder is None else load(_folder, leaves, structure, rest)
+        if program is not None:
+            program.compile_for(leaves)
+
+    call.ahead = ahead  # type: ignore[attr-defined]
     return cast(F, call)
+
+
+def compile_ahead(function: Callable[..., Any], *args: Any) -> None:
+    """Compile a function of `stored_jit` for such arguments as a call of it would, in a thread beside others.
+
+    Of arrays only shapes and types count. Where traces are not kept nothing is done: the call itself will compile.
+    """
+    function.ahead(*args)  # type: ignore[attr-defined]
 
 
 @cache
@@ -150,19 +183,29 @@ def _platform() -> str:
     return device if isinstance(device, str) else device.platform
 
 
-def _program(exported: Any, skeleton: Any, options: Options | None) -> Callable[..., Any]:
-    """A callable of a trace: of the leaves of its arguments, returning the tree that the function does."""
-    run = exported.call if options is None else jax.jit(exported.call, compiler_options=options)
-    structure = jax.tree.structure(skeleton)
-    return lambda *leaves: jax.tree.unflatten(structure, run(*leaves))
+class _Program:
+    """A trace, to be called with the leaves of its arguments; returns the tree that the function does."""
+
+    def __init__(self, exported: Any, skeleton: Any, options: Options | None):
+        self._run: Any = (
+            exported.call if options is None else jax.jit(exported.call, compiler_options=options)
+        )
+        self._structure = jax.tree.structure(skeleton)
+
+    def __call__(self, *leaves: Any) -> Any:
+        return jax.tree.unflatten(self._structure, self._run(*leaves))
+
+    def compile_for(self, leaves: list[Any]) -> None:
+        if hasattr(self._run, "lower"):
+            self._run = self._run.lower(*leaves).compile()
 
 
-def _read(path: Path, options: Options | None) -> Callable[..., Any] | None:
+def _read(path: Path, options: Options | None) -> _Program | None:
     from jax import export
 
     try:
         serialised, skeleton = pickle.loads(path.read_bytes())
-        return _program(export.deserialize(serialised), skeleton, options)
+        return _Program(export.deserialize(serialised), skeleton, options)
     # Whatever is wrong with it, a trace can be made anew.
     except Exception:
         return None
@@ -170,7 +213,7 @@ def _read(path: Path, options: Options | None) -> Callable[..., Any] | None:
 
 def _trace(
     function: Callable[..., Any], kinds: list[Any], where: str, path: Path, options: Options | None
-) -> Callable[..., Any] | None:
+) -> _Program | None:
     from jax import export
 
     structure = None
@@ -197,4 +240,4 @@ def _trace(
         Path(file.name).replace(path)
     except OSError:
         pass
-    return _program(exported, skeleton, options)
+    return _Program(exported, skeleton, options)

@@ -95,6 +95,11 @@ def update_rows(
     return mean, covariance, cost, done
 
 
+def filtered_size(rows: Rows) -> int:
+    """Of the covariances of `closed_loop`: [θ, r, v], or [θ, v] where no height is observed."""
+    return 6 if rows.height is None else 9
+
+
 class Filtered(NamedTuple):
     """What is known of each state by its own rows and all before."""
 
@@ -119,7 +124,7 @@ def closed_loop(
     Covariances, the prior's too, are of [θ, r, v] or, where no height is observed, of [θ, v]: position is then
     integrated, not corrected.
     """
-    size = 6 if rows.height is None else 9
+    size = filtered_size(rows)
 
     def part(matrix):
         if len(matrix) == size:

@@ -1,6 +1,7 @@
 """All segments of a recording, in parallel or one after the other (paper A, Section 5)."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -9,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsat.inertial.calibration import Calibration, calibrate
-from jaxsat.inertial.programs import UNOPTIMISED, stored_jit
-from jaxsat.inertial.smoother import Filtered, closed_loop
+from jaxsat.inertial.programs import UNOPTIMISED, Beside, compile_ahead, stored_jit, usable_cores
+from jaxsat.inertial.smoother import Filtered, closed_loop, filtered_size
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.experience import Heard, experienced
@@ -33,9 +34,10 @@ from jaxsat.signals.rests import Segments
 Progress = Callable[[int, int], None]
 """Called with (segments done, segments in all)."""
 
-# So many segments are solved at once; more would gain nothing on a CPU and wait for the slowest.
-LANES = 64
-# `map` holds some matrices of values × values for each: of all together one has no more entries than of 64 × 512².
+# So many segments are solved at once at most, and as many on each other core; more would gain nothing on a CPU and
+# wait for the slowest.
+LANES = 32
+# `map` holds some matrices of values × values for each: of all together one has no more entries than of 32 × 512².
 ENTRIES = LANES * 512**2
 # Gauss-Newton steps from no calibration: a third changes no digit that is reported.
 FIRST_STEPS = 2
@@ -201,24 +203,52 @@ def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 1
     length = np.where(segments.departure >= 0, segments.rest_end - segments.arrival, 0)
     table = np.zeros((len(segments), 10, 10))
     # Rests of like length side by side: all wait for the longest.
-    order = np.argsort(length)
-    for first in range(0, len(order), LANES):
-        mine = order[first : first + LANES]
-        lanes = bucket(len(mine), 1)
+    for mine in _evenly(np.argsort(length), 2 * LANES):
+        lanes = _lanes(len(mine))
         start, steps = pad(segments.arrival[mine], lanes), pad(length[mine], lanes)
         table[mine] = np.asarray(_arrivals(trial, start, start + steps, steps.max()))[: len(mine)]
     return table
 
 
+def _evenly(indices: Int[np.ndarray, "S"], most: int) -> list[Int[np.ndarray, "L"]]:
+    """In the fewest parts of at most so many."""
+    return np.array_split(indices, max(1, -(-len(indices) // most)))
+
+
+def _lanes(count: int) -> int:
+    """A few numbers, so that few programs are compiled: 1, 4, 8, 16, 24, …"""
+    return bucket(count, 1) if count <= 4 else -(-count // 8) * 8
+
+
 def _solve_some(
-    trial, calibrated, departures, table, segments: Segments, mine, prior, sizes: Sizes, options, fills: Fills
-) -> None:
-    """Solve the segments `mine`, padded to a bucket of lanes, and record them."""
-    lanes = bucket(len(mine), 1)
-    given = (departures, table[mine], segments.departure[mine], segments.arrival[mine])
-    (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x, lanes), given)
+    calibrated: Trial, departures, table, segments: Segments, prior, options, chunk
+) -> tuple[SegmentFill, Values]:
+    """Solve some segments, of `solved_together`, padded to a number of lanes; departures, table: of all segments."""
+    mine, sizes = chunk
+    lanes = _lanes(len(mine))
+    given = (departures, table, segments.departure, segments.arrival)
+    (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x[mine], lanes), given)
     found = _solve(calibrated, states, covariances, table, departure, arrival, prior, sizes, options)
-    fills.record(trial, mine, *found)
+    return jax.block_until_ready(found)
+
+
+def prepare_search(
+    trial: Trial, segments: Segments, options: Options, *, together: bool
+) -> SignalPrior | None:
+    """What a search takes from the signals alone, `compensate_parallel` (together) or `compensate_sequential`.
+
+    That is the signal prior, for methods that have one. The program of the search is compiled too: it takes longest,
+    so this goes on beside what else precedes the search.
+    """
+    prior = _prior(trial) if options.method == "map" else None
+    size = filtered_size(trial.rows)
+    here, counts = trial.calibrated(Calibration.none()), count_values(trial.sign, segments)
+    for mine, sizes in solved_together(*counts) if together else [_one_by_one(*counts)]:
+        lanes = _lanes(len(mine)) if together else 1
+        blank = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)
+        lane = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), blank)
+        compile_ahead(_solve, here, *lane, prior, sizes, options)
+    return prior
 
 
 def compensate_parallel(
@@ -226,6 +256,7 @@ def compensate_parallel(
     segments: Segments,
     options: Options,
     calibration: Calibration,
+    prepared: Callable[[], SignalPrior | None],
     sweeps: int,
     progress: Progress | None = None,
 ) -> tuple[Fills, Calibration]:
@@ -233,29 +264,32 @@ def compensate_parallel(
 
     `map` also learns from each sweep what gaps like a gap lost.
 
-    calibration: to begin with; the one that goes with the fills is returned with them.
+    calibration: to begin with; the one that goes with the fills is returned with them. prepared: gives what
+    `prepare_search` does, which is asked for when nothing else is left to do.
     """
     fills = Fills.nothing(trial, len(segments))
-    prior = _prior(trial) if options.method == "map" else None
     chunks = list(solved_together(*count_values(trial.sign, segments)))
-    total, done = sum(len(mine) for mine, _ in chunks), 0
-    for _ in range(sweeps):
-        here = trial.calibrated(calibration)
-        filled = fills.signal - np.asarray(calibration.constants)[None, :6]
-        filtered = filter_recording(here, filled, fills.variance)
-        states, covariances, _ = jax.tree.map(np.asarray, filtered)
-        table = arrival_table(here, segments)
-        for mine, sizes in chunks:
-            at = np.maximum(segments.departure[mine], 0)
-            departures = jax.tree.map(lambda x, at=at: x[at], (states, covariances))
-            _solve_some(trial, here, departures, table, segments, mine, prior, sizes, options, fills)
-            done += len(mine)
-            if progress:
-                progress(done, sweeps * total)
-        calibration = recalibrated(trial, fills, options, calibration)
-        if prior is not None:
-            taught = _experienced(prior.experience, trial.sign, fills.heard, fills.asked)
-            prior = eqx.tree_at(lambda p: p.experience, prior, taught)
+    total, done, prior = sum(len(mine) for mine, _ in chunks), 0, None
+    first = np.maximum(segments.departure, 0)
+    with Beside(usable_cores()) as beside:
+        for sweep in range(sweeps):
+            here = trial.calibrated(calibration)
+            filled = fills.signal - np.asarray(calibration.constants)[None, :6]
+            arriving = beside.submit(arrival_table, here, segments)
+            filtered = filter_recording(here, filled, fills.variance)
+            departures = jax.tree.map(lambda x: np.asarray(x)[first], (filtered.state, filtered.covariance))
+            if sweep == 0:
+                prior = prepared()
+            solve = partial(_solve_some, here, departures, arriving.result(), segments, prior, options)
+            for (mine, _), found in zip(chunks, beside.map(solve, chunks), strict=True):
+                fills.record(trial, mine, *found)
+                done += len(mine)
+                if progress:
+                    progress(done, sweeps * total)
+            calibration = recalibrated(trial, fills, options, calibration)
+            if prior is not None:
+                taught = _experienced(prior.experience, trial.sign, fills.heard, fills.asked)
+                prior = eqx.tree_at(lambda p: p.experience, prior, taught)
     return fills, calibration
 
 
@@ -269,14 +303,23 @@ def recalibrated(trial: Trial, fills: Fills, options: Options, calibration: Cali
 def solved_together(
     samples: Int[np.ndarray, "S"], values: Int[np.ndarray, "S"]
 ) -> Iterator[tuple[Int[np.ndarray, "L"], Sizes]]:
-    """Segments that saturate, those of like size together; a short recording is one chunk, so one program."""
+    """Segments that saturate, those of like size together; a short recording is of one size, so one program."""
     busy = np.flatnonzero(values)
     busy = busy[np.lexsort((samples[busy], values[busy]))]
     while len(busy):
-        longest = int(values[busy[:LANES]].max())
+        longest = int(values[busy[: 2 * LANES]].max())
         lanes = min(LANES, max(1, ENTRIES // padded_sizes(1, longest).values ** 2))
-        mine, busy = busy[:lanes], busy[lanes:]
-        yield mine, padded_sizes(int(samples[mine].max()), int(values[mine].max()))
+        alike, busy = busy[: 2 * lanes], busy[2 * lanes :]
+        sizes = padded_sizes(int(samples[alike].max()), int(values[alike].max()))
+        yield from ((mine, sizes) for mine in _evenly(alike, lanes))
+
+
+def _one_by_one(
+    samples: Int[np.ndarray, "S"], values: Int[np.ndarray, "S"]
+) -> tuple[Int[np.ndarray, "L"], Sizes]:
+    """Segments that saturate, and the sizes of one program for all of them."""
+    busy = np.flatnonzero(values)
+    return busy, padded_sizes(int(samples[busy].max(initial=1)), int(values[busy].max(initial=1)))
 
 
 def compensate_sequential(
@@ -284,21 +327,18 @@ def compensate_sequential(
     segments: Segments,
     options: Options,
     calibration: Calibration,
+    prepared: Callable[[], SignalPrior | None],
     progress: Progress | None = None,
 ) -> tuple[Fills, Calibration]:
     """The paper's order: each segment departs from the filtered end of the one before, filled already.
 
-    calibration: as in `compensate_parallel`.
+    calibration, prepared: as in `compensate_parallel`.
     """
     fills = Fills.nothing(trial, len(segments))
     here, bias = trial.calibrated(calibration), np.asarray(calibration.constants)[None, :6]
     table = arrival_table(here, segments)
-    prior = _prior(trial) if options.method == "map" else None
-    samples, values = count_values(trial.sign, segments)
-    busy = np.flatnonzero(values)
-    # One program for all of them.
-    sizes = padded_sizes(int(samples[busy].max(initial=1)), int(values[busy].max(initial=1)))
-    state, covariance, at = trial.prior, trial.prior_covariance, 0
+    busy, sizes = _one_by_one(*count_values(trial.sign, segments))
+    state, covariance, at, prior = trial.prior, trial.prior_covariance, 0, prepared()
     for count, index in enumerate(busy.tolist()):
         departure = max(0, int(segments.departure[index]))
         span = (at, departure + 1, at == 0)
@@ -308,8 +348,10 @@ def compensate_sequential(
             lambda x, last=last: np.asarray(x[last]), (filtered.state, filtered.covariance)
         )
         at = departure
-        departures = jax.tree.map(lambda x: x[None], (state, covariance))
-        _solve_some(trial, here, departures, table, segments, np.array([index]), prior, sizes, options, fills)
+        departures = jax.tree.map(lambda x: np.stack([x] * len(segments)), (state, covariance))
+        mine = np.array([index])
+        found = _solve_some(here, departures, table, segments, prior, options, (mine, sizes))
+        fills.record(trial, mine, *found)
         if progress:
             progress(count + 1, len(busy))
     return fills, recalibrated(trial, fills, options, calibration)

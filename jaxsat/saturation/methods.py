@@ -123,13 +123,12 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
             value, gradient = value + delta @ (known.slope + 0.5 * pull), gradient + known.slope + pull
         return value, *jax.tree.map(lambda x: back(x)[0], (gradient, columns))
 
-    # f(0), and the curvature at the start; both from one compiled evaluation.
+    # f(0), and the curvature at the start, of `direct` the same point; both from one compiled evaluation.
     first, back = jax.vjp(search.delta, search.start)
-    values, columns, effects = jax.lax.map(
-        lambda delta: value_and_root(delta, condensed, gravity), jnp.stack([jnp.zeros_like(first), first])
-    )
+    points = jnp.stack([jnp.zeros_like(first), first][: 1 if options.method == "direct" else 2])
+    values, columns, effects = jax.lax.map(lambda delta: value_and_root(delta, condensed, gravity), points)
     before = values[0]
-    curvature = sum(back(column[1])[0] ** 2 for column in columns)
+    curvature = sum(back(column[-1])[0] ** 2 for column in columns)
     if known is not None:
         curvature = curvature + jnp.diagonal(known.precision)
     # A variable that the data do not see is scaled by its range; one without range does not move.

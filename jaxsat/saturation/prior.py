@@ -255,15 +255,17 @@ def _energy(
     and weight of the innovations that it is a part of: of its own sample and those after it.
     """
     size = predictor.shape[1]
-    band = [
-        jnp.sum((weight * predictor)[:, : size - d] * predictor[:, d:], axis=1) for d in range(size)
-    ]  # with what lies d samples before
+    steps = jnp.arange(size)
+    # Of each value with what lies d samples before, the part of each of its innovations: columns d, terms k.
+    both = steps[:, None] + steps[None]
+    later = jnp.where(both < size, predictor[:, jnp.minimum(both, size - 1)], 0.0)
+    band = jnp.sum((weight * predictor)[:, None] * later, axis=2)
     lag = sample[:, None] - sample[None]
     near = (channel[:, None] == channel[None]) & (jnp.abs(lag) < size)
-    before = jnp.take_along_axis(jnp.stack(band, axis=1), jnp.minimum(jnp.abs(lag), size - 1), axis=1)
+    before = jnp.take_along_axis(band, jnp.minimum(jnp.abs(lag), size - 1), axis=1)
     precision = jnp.where(near, jnp.where(lag >= 0, before, before.T), 0.0)
-    parts = [jnp.sum(predictor[:, ::-1] * window[:, k : k + size], axis=1) for k in range(size)]
-    return precision, jnp.sum(weight * predictor * (jnp.stack(parts, axis=1) - mean), axis=1)
+    innovation = jnp.sum(predictor[:, None, ::-1] * window[:, both], axis=2)
+    return precision, jnp.sum(weight * predictor * (innovation - mean), axis=1)
 
 
 def quadratic_form(

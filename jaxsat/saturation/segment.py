@@ -324,17 +324,21 @@ def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple
     once must not be known when it is compiled. (On a CPU `optimization_barrier` is gone before anything is fused.)
     """
 
-    @jax.jit
-    def evaluate(carry):
-        motion = _pass(condensed, delta)
-        at = _arrive(condensed, motion, gravity)
-        inner = _inner(condensed, motion, at)
-        return carry[0] + 1, (inner, _root(_effect(condensed, motion, at), inner))
-
-    shapes = jax.eval_shape(evaluate, (jnp.asarray(0), None))
+    once = delta, condensed, gravity
+    shapes = jax.eval_shape(_evaluated, *once)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     times = jnp.where(jnp.isnan(gravity), 2, 1)
-    return jax.lax.while_loop(lambda carry: carry[0] < times, evaluate, blank)[1]
+    return jax.lax.while_loop(
+        lambda carry: carry[0] < times, lambda carry: (carry[0] + 1, _evaluated(*once)), (0, blank)
+    )[1]
+
+
+@jax.jit  # so that it is traced once
+def _evaluated(delta, condensed: Condensed, gravity):
+    motion = _pass(condensed, delta)
+    at = _arrive(condensed, motion, gravity)
+    inner = _inner(condensed, motion, at)
+    return inner, _root(_effect(condensed, motion, at), inner)
 
 
 def _root(effect: Matrix, inner: _Inner) -> tuple[Float[Array, "m"], ...]:
