@@ -31,7 +31,8 @@ from jaxsat.saturation.compensate import (
     calibrate_recording,
     compensate_parallel,
     compensate_sequential,
-    prepare_search,
+    learn_prior,
+    trace_search,
 )
 from jaxsat.saturation.layout import Trial, bucket, pad
 from jaxsat.saturation.methods import Compensation, Options
@@ -147,15 +148,23 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         options = search_options(config, config.method)
     # What the search does not wait for goes on beside it.
     with Beside(2) as beside:
-        preparing = options and beside.submit(prepare_search, searched, segments, options, together=together)
+        programs = trace_search(searched, segments, options, together=together) if options else []
+        compiling = [beside.submit(program) for program in programs]
+        learning = options and beside.submit(learn_prior, searched, options)
         calibration = calibrate_by_rests(searched, config)
         clock.lap("calibration")
         sure = trial.calibrated(calibration)
         ignoring = beside.submit(_smooth, sure, config)
         compensated = None
-        if preparing:
+        if options:
+
+            def learned():
+                for program in compiling:
+                    program.result()
+                return learning.result()
+
             report = partial(progress, "segments")
-            given = searched, segments, options, calibration, preparing.result
+            given = searched, segments, options, calibration, learned
             if together:
                 passes = config.saturation.passes(config.method)
                 fills, calibration = compensate_parallel(*given, passes, report)

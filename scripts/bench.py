@@ -27,7 +27,19 @@ import numpy as np
 from peers import shortest
 from peers.paper_way import bar_problem, dense_objective, paper_way
 from peers.smoothers import cuthbert_smoother, dynamax_smoother, linear_model, walking_trials
-from problems import OPTIONS, Batch, bars, direct, run_direct, strapdown_seconds, swept, walk, with_rests
+from problems import (
+    OPTIONS,
+    PART,
+    Batch,
+    bars,
+    direct,
+    run_direct,
+    side_by_side,
+    strapdown_seconds,
+    swept,
+    walk,
+    with_rests,
+)
 
 from jaxsat import Sensor, load_config, simulate
 from jaxsat.inertial.programs import compiled
@@ -58,9 +70,11 @@ def objective_vs_strapdown() -> Iterator[Row]:
 
     condensed = jax.jit(jax.vmap(segment))(jax.tree.map(jnp.asarray, batch.trials))
     delta = jnp.ones((256, batch.sizes.values))
-    evaluate = compiled(jax.vmap(lambda d, c, g: value_gradient_root(d, c, g)[:2], in_axes=(0, 0, None)))
+    evaluate = compiled(jax.vmap(lambda each, g: value_gradient_root(*each, g)[:2], in_axes=(0, None)))
+    gravity = jnp.asarray(GRAVITY)
+    run = side_by_side(lambda each: evaluate(each, gravity), (delta, condensed), -(-256 // PART))
     bare = strapdown_seconds()
-    seconds = shortest(lambda: evaluate(delta, condensed, jnp.asarray(GRAVITY)), 50)
+    seconds = shortest(run, 50)
     bare = min(bare, strapdown_seconds())
     last = strapdown_seconds(all_states=False)
     yield Row(
@@ -73,8 +87,9 @@ def objective_vs_strapdown() -> Iterator[Row]:
 def direct_vs_strapdown() -> Iterator[Row]:
     bare = strapdown_seconds()
     batch = bars(256)
-    seconds = shortest(run_direct(batch, False))
-    whole = shortest(run_direct(batch, True))
+    parts = -(-256 // PART)
+    seconds = shortest(run_direct(batch, False, parts))
+    whole = shortest(run_direct(batch, True, parts))
     found, _ = run_direct(batch, False)()
     assert (np.asarray(found.solution.status) == 0).all(), "every search converges"
     yield Row(
@@ -193,9 +208,7 @@ def smoother_vs_peers() -> Iterator[Row]:
 
 
 def batch_amortisation() -> Iterator[Row]:
-    # On a CPU as a sweep does it: on each core a part that does not leave its cache.
-    parts = 1 if jax.default_backend() == "gpu" else 8
-    one, many = (shortest(run_direct(bars(size), False, n), 10) for size, n in ((1, 1), (1024, parts)))
+    one, many = (shortest(run_direct(bars(size), False, -(-size // PART)), 10) for size in (1, 1024))
     yield Row(
         "batch_amortisation", many / 1024 / one, "1", "lower", 0.05, None,
         f"direct estimate of a trial: {1e3 * one:.2f} ms alone, {1e3 * many / 1024:.3f} ms among 1,024",
@@ -214,7 +227,7 @@ def growth() -> Iterator[Row]:
         "growth_time", long / short, "1", "lower", 9, None,
         f"`estimate` with direct: {short:.2f} s for 3,072 samples, {long:.2f} s for 24,576",
     )  # fmt: skip
-    few, many = (shortest(run_direct(bars(size), False), 10) for size in (128, 1024))
+    few, many = (shortest(run_direct(bars(size), False, -(-size // PART)), 10) for size in (128, 1024))
     yield Row(
         "growth_batch", many / few, "1", "lower", 8.5, None,
         f"direct estimate: {1e3 * few:.0f} ms for 128 trials, {1e3 * many:.0f} ms for 1,024",

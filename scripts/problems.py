@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cache, partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -99,20 +100,23 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
     )
 
 
-def run_direct(batch: Batch, whole: bool, parts: int = 1) -> Callable:
-    """All trials at once; or so many parts of them, side by side on all cores."""
-    solve = compiled(jax.vmap(lambda trial: direct(trial, batch, whole)))
-    leaves, structure = jax.tree.flatten(batch.trials)
+def side_by_side(solve: Callable, arguments: Any, parts: int) -> Callable:
+    """solve(arguments) by so many parts of their leading axis, on all cores as a sweep uses them."""
+    leaves, structure = jax.tree.flatten(arguments)
     split = zip(*(np.array_split(leaf, parts) for leaf in leaves), strict=True)
-    trials = [jax.device_put(jax.tree.map(jnp.asarray, structure.unflatten(part))) for part in split]
+    given = [jax.device_put(jax.tree.map(jnp.asarray, structure.unflatten(part))) for part in split]
     if parts == 1:
-        return lambda: solve(trials[0])
+        return lambda: solve(given[0])
+    cores = Beside(usable_cores())
+    return lambda: list(cores.map(lambda part: jax.block_until_ready(solve(part)), given))
 
-    def side_by_side():
-        with Beside(usable_cores()) as beside:
-            return list(beside.map(lambda part: jax.block_until_ready(solve(part)), trials))
 
-    return side_by_side
+def run_direct(batch: Batch, whole: bool, parts: int = 1) -> Callable:
+    return side_by_side(compiled(jax.vmap(lambda trial: direct(trial, batch, whole))), batch.trials, parts)
+
+
+# On a CPU as a sweep does it: on each core a part, none so large that it leaves the cache.
+PART = 1024 if jax.default_backend() == "gpu" else 128
 
 
 @cache

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -149,19 +149,19 @@ def stored_jit(function: F, options: Options | None = OPTIONS) -> F:
     def ahead(*args):
         leaves, structure, rest = flat(args)
         program = None if _folder is None else load(_folder, leaves, structure, rest)
-        if program is not None:
-            program.compile_for(leaves)
+        return (lambda: None) if program is None else partial(program.compile_for, leaves)
 
     call.ahead = ahead  # type: ignore[attr-defined]
     return cast(F, call)
 
 
-def compile_ahead(function: Callable[..., Any], *args: Any) -> None:
-    """Compile a function of `stored_jit` for such arguments as a call of it would, in a thread beside others.
+def trace_ahead(function: Callable[..., Any], *args: Any) -> Callable[[], None]:
+    """Trace a function of `stored_jit` for such arguments; what is returned compiles it, in a thread beside others.
 
     Of arrays only shapes and types count. Where traces are not kept nothing is done: the call itself will compile.
+    Python traces one function at a time however many threads there are, so what takes longest to compile comes first.
     """
-    function.ahead(*args)  # type: ignore[attr-defined]
+    return function.ahead(*args)  # type: ignore[attr-defined]
 
 
 @cache

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsat.inertial.calibration import Calibration, calibrate
-from jaxsat.inertial.programs import UNOPTIMISED, Beside, compile_ahead, stored_jit, usable_cores
+from jaxsat.inertial.programs import UNOPTIMISED, Beside, stored_jit, trace_ahead, usable_cores
 from jaxsat.inertial.smoother import Filtered, closed_loop, filtered_size
 from jaxsat.inertial.strapdown import NavState, Samples
 from jaxsat.saturation.arrival import arrivals
@@ -27,7 +27,7 @@ from jaxsat.saturation.layout import (
     padded_sizes,
 )
 from jaxsat.saturation.methods import Options, SegmentFill, solve_segment
-from jaxsat.saturation.prior import SignalPrior, learn
+from jaxsat.saturation.prior import SignalPrior, blank, learn
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.rests import Segments
 
@@ -232,23 +232,27 @@ def _solve_some(
     return jax.block_until_ready(found)
 
 
-def prepare_search(
+def trace_search(
     trial: Trial, segments: Segments, options: Options, *, together: bool
-) -> SignalPrior | None:
-    """What a search takes from the signals alone, `compensate_parallel` (together) or `compensate_sequential`.
-
-    That is the signal prior, for methods that have one. The program of the search is compiled too: it takes longest,
-    so this goes on beside what else precedes the search.
-    """
-    prior = _prior(trial) if options.method == "map" else None
-    size = filtered_size(trial.rows)
+) -> list[Callable[[], None]]:
+    """What compiles the programs of `compensate_parallel` (together) or `compensate_sequential` that take longest."""
+    size, prior = filtered_size(trial.rows), None
+    if options.method == "map":
+        prior = blank(len(trial.period))
     here, counts = trial.calibrated(Calibration.none()), count_values(trial.sign, segments)
+    programs = {}
     for mine, sizes in solved_together(*counts) if together else [_one_by_one(*counts)]:
         lanes = _lanes(len(mine)) if together else 1
-        blank = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)
-        lane = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), blank)
-        compile_ahead(_solve, here, *lane, prior, sizes, options)
-    return prior
+        lane = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)
+        lane = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), lane)
+        if (lanes, sizes) not in programs:
+            programs[lanes, sizes] = trace_ahead(_solve, here, *lane, prior, sizes, options)
+    return list(programs.values())
+
+
+def learn_prior(trial: Trial, options: Options) -> SignalPrior | None:
+    """What a search takes from the signals alone: the signal prior, for methods that have one."""
+    return _prior(trial) if options.method == "map" else None
 
 
 def compensate_parallel(
@@ -256,7 +260,7 @@ def compensate_parallel(
     segments: Segments,
     options: Options,
     calibration: Calibration,
-    prepared: Callable[[], SignalPrior | None],
+    learned: Callable[[], SignalPrior | None],
     sweeps: int,
     progress: Progress | None = None,
 ) -> tuple[Fills, Calibration]:
@@ -264,8 +268,8 @@ def compensate_parallel(
 
     `map` also learns from each sweep what gaps like a gap lost.
 
-    calibration: to begin with; the one that goes with the fills is returned with them. prepared: gives what
-    `prepare_search` does, which is asked for when nothing else is left to do.
+    calibration: to begin with; the one that goes with the fills is returned with them. learned: gives what
+    `learn_prior` does, and is asked when nothing else is left to do.
     """
     fills = Fills.nothing(trial, len(segments))
     chunks = list(solved_together(*count_values(trial.sign, segments)))
@@ -279,7 +283,7 @@ def compensate_parallel(
             filtered = filter_recording(here, filled, fills.variance)
             departures = jax.tree.map(lambda x: np.asarray(x)[first], (filtered.state, filtered.covariance))
             if sweep == 0:
-                prior = prepared()
+                prior = learned()
             solve = partial(_solve_some, here, departures, arriving.result(), segments, prior, options)
             for (mine, _), found in zip(chunks, beside.map(solve, chunks), strict=True):
                 fills.record(trial, mine, *found)
@@ -327,18 +331,18 @@ def compensate_sequential(
     segments: Segments,
     options: Options,
     calibration: Calibration,
-    prepared: Callable[[], SignalPrior | None],
+    learned: Callable[[], SignalPrior | None],
     progress: Progress | None = None,
 ) -> tuple[Fills, Calibration]:
     """The paper's order: each segment departs from the filtered end of the one before, filled already.
 
-    calibration, prepared: as in `compensate_parallel`.
+    calibration, learned: as in `compensate_parallel`.
     """
     fills = Fills.nothing(trial, len(segments))
     here, bias = trial.calibrated(calibration), np.asarray(calibration.constants)[None, :6]
     table = arrival_table(here, segments)
     busy, sizes = _one_by_one(*count_values(trial.sign, segments))
-    state, covariance, at, prior = trial.prior, trial.prior_covariance, 0, prepared()
+    state, covariance, at, prior = trial.prior, trial.prior_covariance, 0, learned()
     for count, index in enumerate(busy.tolist()):
         departure = max(0, int(segments.departure[index]))
         span = (at, departure + 1, at == 0)

@@ -15,6 +15,7 @@ share only (`SHARE`).
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.dense import inverse_positive, solve_positive
@@ -58,6 +59,13 @@ class SignalPrior(eqx.Module):
     """Whether hidden peaks of that length were further off filled than cut off."""
     experience: Experience
     """What the search before taught; with none of it at first."""
+
+
+def blank(samples: int) -> SignalPrior:
+    """Of the shapes of one that is learned from so many samples."""
+    by_sample, by_length = np.zeros((samples, 6)), np.zeros((6, len(NODES)))
+    predictor = np.zeros((6, ORDER + 3))
+    return SignalPrior(predictor, by_sample, by_sample, by_length, by_length > 0.0, Experience.none())
 
 
 def learn(
