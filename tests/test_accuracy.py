@@ -10,8 +10,11 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
+from jaxsat import estimate, load_config, simulate
 from jaxsat.signals.recording import Recording
+from jaxsat.studies.motions import Bar
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -134,3 +137,46 @@ def test_what_a_gap_lost_is_compared_with_the_recording_before_it_was_clipped(bo
     top = np.argmax(np.abs(filled))
     peak = (filled[top] - true[np.argmax(np.abs(true))]) / found.signal_sd[i + top, 1]
     assert rows.loc["peaks", "z"] == pytest.approx(peak) and len(rows) == j - i + 2
+
+
+@pytest.mark.parametrize("vertical", [True, False])
+def test_a_fill_without_its_turn_about_some_axes_keeps_that_about_the_others(board, vertical):
+    ablation = importlib.import_module("accuracy_ablation")
+    rng, n = np.random.default_rng(0), 60
+    q = rng.normal(size=(n, 4))
+    rest, saturated = np.zeros(n, bool), np.zeros((n, 6), bool)
+    rest[:10] = rest[30:35] = rest[50:] = True
+    saturated[15:20, 1] = saturated[17:22, 2] = saturated[40:45, 0] = saturated[41, 5] = True
+    truth = rng.normal(size=(n, 6))
+    found = SimpleNamespace(
+        trajectory=SimpleNamespace(q_nb=q / np.linalg.norm(q, axis=1, keepdims=True)),
+        saturated=saturated,
+        filled=truth + np.where(saturated, rng.normal(size=(n, 6)), 0.0),
+        rest=rest,
+    )
+
+    def turns(signal):
+        at = Rotation.from_quat(found.trajectory.q_nb, scalar_first=True)
+        away = at.apply((signal - truth)[:, :3])
+        return np.array([away[10:30].sum(axis=0), away[35:50].sum(axis=0)])
+
+    before, after = turns(found.filled), turns(ablation.turned(found, truth, vertical))
+    expected = before * ([1, 1, 0] if vertical else [0, 0, 1])
+    np.testing.assert_allclose(after, expected, atol=1e-12)
+    assert (np.abs(before) > 0.1).all()
+
+
+def test_the_path_of_a_signal_that_is_true_again_is_the_unclipped_one(board):
+    ablation = importlib.import_module("accuracy_ablation")
+    recording, truth = simulate(Bar(), rate=100.0, duration=1.6, key=jax.random.key(0))
+    recording = ablation.resting(recording, truth.rest)
+    whole = estimate(recording, load_config(None, method="standard"))
+    found = estimate(board.clip(recording, gyr=430.0), load_config(None, method="standard"))
+    assert found.saturated.sum() > 10
+    again = np.where(found.saturated, recording.signal, found.recording.signal)
+    made = ablation.path(found.recording, again, found.rest)
+    np.testing.assert_allclose(made.trajectory.position, whole.trajectory.position, atol=1e-12)
+    off = found.trajectory.position[-1] - whole.trajectory.position[-1]
+    assert np.linalg.norm(off) > 0.1
+    true = ablation.of_gaps(found, lambda inside, channel: recording.signal[inside, channel])
+    np.testing.assert_array_equal(true, again)

@@ -340,6 +340,32 @@ def test_what_is_learned_of_the_sensors_is_said():
     assert errors[0] < errors[1]
 
 
+@pytest.mark.parametrize(
+    "settings", [{"method": "map"}, {"saturation.segments": "sequential"}, {"height.mode": "zero"}]
+)
+def test_the_search_is_compiled_ahead_for_what_it_is_called_with(settings, monkeypatch):
+    """Or it would be compiled twice: the call finds a program by the shapes, types and settings of its arguments."""
+    seen, solve = {}, compensate._solve
+
+    def told(*arguments):
+        arrays, rest = eqx.partition(arguments, eqx.is_array)
+        return jax.tree.map(jax.typeof, arrays), jax.tree.structure(arrays), repr(rest)
+
+    def ahead(function, *arguments):
+        seen.setdefault("ahead", told(*arguments))
+        return lambda: None
+
+    def call(*arguments):
+        seen.setdefault("called", told(*arguments))
+        return solve(*arguments)
+
+    monkeypatch.setattr(compensate, "trace_ahead", ahead)
+    monkeypatch.setattr(compensate, "_solve", call)
+    recording, _ = bar(0, gyr_rail=7.5)
+    estimate(recording, load_config(None, **BAR, **{"method": "direct", **settings}))
+    assert seen["ahead"] == seen["called"]
+
+
 def test_long_segments_are_solved_fewer_at_a_time():
     """Matrices of values by values keep to a size; each segment that saturates is solved once, likes together."""
     rng = np.random.default_rng(0)

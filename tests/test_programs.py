@@ -9,10 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
+from jax.stages import Compiled
 from threadpoolctl import threadpool_info
 
 from jaxsat.inertial import programs
-from jaxsat.inertial.programs import computing, keep_traces, on_processor, stored_jit
+from jaxsat.inertial.programs import (
+    Beside,
+    computing,
+    keep_traces,
+    on_processor,
+    stored_jit,
+    trace_ahead,
+)
 
 TRACED = []
 
@@ -93,6 +101,29 @@ def test_a_folder_that_cannot_be_written_costs_a_trace_only(folder):
     folder.parent.joinpath("file").write_text("")
     keep_traces(folder.parent / "file" / "traces")
     check(fresh()(PAIR, np.asarray(2.0), 3))
+
+
+def test_what_is_traced_ahead_is_neither_traced_nor_compiled_by_the_call(folder):
+    run = fresh()
+    with Beside(1) as beside:
+        beside.submit(trace_ahead(run, Pair(np.zeros(3), "a"), np.zeros(()), 3)).result()
+    (program,) = programs._loaded.values()
+    assert isinstance(program._run, Compiled)
+    check(run(PAIR, np.asarray(2.0), 3))
+    assert TRACED == [("a", 3)] and list(programs._loaded.values()) == [program]
+
+
+def test_without_a_folder_nothing_is_done_ahead(folder):
+    keep_traces(None)
+    trace_ahead(stored_jit(scaled), PAIR, np.asarray(2.0), 3)()
+    assert TRACED == []
+
+
+def test_threads_beside_compute_as_the_one_that_submits():
+    with jax.enable_x64(False), Beside(2) as beside:
+        assert beside.submit(lambda: jnp.ones(1).dtype).result() == jnp.float32
+        with computing():
+            assert list(beside.map(lambda n: jnp.ones(n).dtype, [1, 2])) == [jnp.float64] * 2
 
 
 def test_what_cannot_be_kept_runs_all_the_same(folder, monkeypatch):

@@ -63,9 +63,11 @@ class SignalPrior(eqx.Module):
 
 def blank(samples: int) -> SignalPrior:
     """Of the shapes of one that is learned from so many samples."""
-    by_sample, by_length = np.zeros((samples, 6)), np.zeros((6, len(NODES)))
-    predictor = np.zeros((6, ORDER + 3))
-    return SignalPrior(predictor, by_sample, by_sample, by_length, by_length > 0.0, Experience.none())
+    predictor, by_sample, by_length = (
+        jnp.asarray(np.zeros(shape)) for shape in ((6, ORDER + 3), (samples, 6), (6, len(NODES)))
+    )
+    harmful = jnp.asarray(np.zeros((6, len(NODES)), bool))
+    return SignalPrior(predictor, by_sample, by_sample, by_length, harmful, Experience.none())
 
 
 def learn(
