@@ -98,6 +98,14 @@ class Saturation(_Section):
         default=1e-2, gt=0, description="largest accepted optimality residual (scaled, per variable)"
     )
     max_iterations: int = Field(default=1000, ge=1)
+    # On the PyShoe walks of the list `clip`, clipped at 350, 250 and 200 °/s, half of the gaps lost at least 30 to
+    # 100 % more or less than a prior of one channel says.
+    prior_share: float = Field(
+        default=0.3, gt=0, description="least sd of what a gap lost, over what the prior of `map` says of it"
+    )
+    prior_width: float = Field(
+        default=0.5, gt=0, description="root mean square of what gaps lose, in rails, as `map` expects it"
+    )
 
     def passes(self, method: str) -> int:
         """`sweeps` in numbers; the first of `map` teaches the others what gaps lose."""

@@ -36,6 +36,7 @@ from jaxsat.saturation.compensate import (
 )
 from jaxsat.saturation.layout import Trial, bucket, pad
 from jaxsat.saturation.methods import Compensation, Options
+from jaxsat.saturation.prior import Scales
 from jaxsat.signals.rails import Gaps, Rails
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import Segments
@@ -118,7 +119,12 @@ def search_options(config: Config, method: str) -> Options:
         jnp.asarray(chosen.max_iterations),
         jnp.asarray(chosen.tolerance),
         constants_sd(config),
+        prior_scales(config),
     )
+
+
+def prior_scales(config: Config) -> Scales:
+    return Scales(jnp.asarray(config.saturation.prior_width), jnp.asarray(config.saturation.prior_share))
 
 
 def constants_sd(config: Config) -> Float[Array, "9"] | None:

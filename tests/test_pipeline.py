@@ -109,8 +109,8 @@ def test_a_path_is_free_where_the_bound_holds_a_rate():
 def test_what_map_would_worsen_is_left_as_measured_and_only_taken_as_noisier(monkeypatch):
     recording, truth = bar(3, gyr_rail=7.5)
 
-    def all_harmful(trial):
-        prior = signal_prior(trial)
+    def all_harmful(trial, scales):
+        prior = signal_prior(trial, scales)
         return eqx.tree_at(lambda p: p.harmful, prior, jnp.ones_like(prior.harmful))
 
     monkeypatch.setattr(compensate, "_prior", jax.jit(all_harmful))

@@ -13,9 +13,8 @@ from jaxsat.saturation.prior import (
     LEAST_ROUGHNESS,
     ORDER,
     PEAKS,
-    SHARE,
-    WIDTH,
     Known,
+    Scales,
     SignalPrior,
     hidden_peaks,
     learn,
@@ -30,6 +29,7 @@ PERIOD = jnp.asarray(0.01)
 PHI = -np.poly([0.8 * np.exp(0.5j), 0.8 * np.exp(-0.5j), 0.6, -0.4]).real[1:]
 SIGMA = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
 LEARN = jax.jit(learn)
+SCALES = Scales(jnp.asarray(0.5), jnp.asarray(0.3))
 
 
 def filter_of(phi) -> np.ndarray:
@@ -52,7 +52,7 @@ def learned(signal, sign=None, clean=None, moving=None) -> SignalPrior:
     sign = np.zeros((N, 6), int) if sign is None else sign
     clean = (sign == 0) if clean is None else clean
     moving = np.ones(N, bool) if moving is None else moving
-    return LEARN(*map(jnp.asarray, (signal, sign, clean, moving)), PERIOD)
+    return LEARN(*map(jnp.asarray, (signal, sign, clean, moving)), PERIOD, SCALES)
 
 
 def test_the_process_that_made_a_signal_is_learned(walk):
@@ -110,7 +110,7 @@ def test_saturated_and_resting_samples_of_a_channel_say_nothing_of_it(walk):
 def test_recordings_side_by_side_are_those_one_by_one(walk):
     both = jnp.stack([jnp.asarray(walk), jnp.asarray(walk[::-1] + 1.0)])
     sign, moving = jnp.zeros((N, 6), int), jnp.ones(N, bool)
-    found = jax.jit(jax.vmap(lambda x: learn(x, sign, sign == 0, moving, PERIOD)))(both)
+    found = jax.jit(jax.vmap(lambda x: learn(x, sign, sign == 0, moving, PERIOD, SCALES)))(both)
     for i, signal in enumerate(both):
         one = learned(signal)
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(found), strict=True):
@@ -131,7 +131,9 @@ def prior() -> SignalPrior:
     # Innovations as large as they come, and not about zero.
     weight = rng.uniform(0.3, 3.0, size=SHORT.shape) / SIGMA**2
     told = np.tile(filter_of(PHI), (6, 1)), SIGMA * rng.normal(size=SHORT.shape), weight
-    return SignalPrior(*map(jnp.asarray, told), jnp.ones(nodes), jnp.zeros(nodes, bool), Experience.none())
+    return SignalPrior(
+        SCALES, *map(jnp.asarray, told), jnp.ones(nodes), jnp.zeros(nodes, bool), Experience.none()
+    )
 
 
 def known(prior, signal=SHORT, sample=SAMPLE, channel=CHANNEL, sign=SIGN) -> Known:
@@ -160,7 +162,7 @@ def energy(prior, delta) -> float:
     first = len(SHORT) - len(left)
     left = left - np.asarray(prior.mean)[first:]
     rail = np.abs(SHORT[SAMPLE, CHANNEL])[real]
-    pull = np.sum((delta[real] / (WIDTH * rail)) ** 2 / LENGTH[real])
+    pull = np.sum((delta[real] / (SCALES.width * rail)) ** 2 / LENGTH[real])
     return 0.5 * np.sum(left**2 * np.asarray(prior.weight)[first:]) + 0.5 * pull
 
 
@@ -186,7 +188,7 @@ def test_the_scale_of_what_a_gap_lost_is_known_to_a_share(prior):
     mean = -within @ slope
     fill = np.where(SIGN != 0, np.maximum(mean, 0.0), 0.0)
     assert (fill[SIGN != 0] > 0.0).any()
-    expected = within + SHARE**2 * np.where(np.equal.outer(GAP, GAP), np.outer(fill, fill), 0.0)
+    expected = within + SCALES.share**2 * np.where(np.equal.outer(GAP, GAP), np.outer(fill, fill), 0.0)
     np.testing.assert_allclose(found.covariance, expected, atol=1e-9)
     np.testing.assert_allclose(found.precision @ expected, np.eye(M), atol=1e-7)
     np.testing.assert_allclose(np.linalg.solve(found.precision, -np.asarray(found.slope)), mean, atol=1e-8)
@@ -250,10 +252,12 @@ def hidden_errors(x, ok, rail, told, length, way) -> list[tuple[float, float, fl
         lost, top = np.sum(y[inside] - level), y[inside].max()
         y[inside] = level
         moved = shift[:, inside]
-        own = moved.T @ (weight[:, None] * moved) + np.eye(length) / ((WIDTH * rail) ** 2 * length)
+        own = moved.T @ (weight[:, None] * moved) + np.eye(length) / ((SCALES.width * rail) ** 2 * length)
         filled = np.linalg.solve(own, -moved.T @ (weight * (shift @ y - way * mean))).sum()
         variance, filled = np.linalg.inv(own).sum(), max(filled, 0.0)
-        found.append(((filled - lost) ** 2, lost**2, variance + (SHARE * filled) ** 2, (top / rail) ** 4))
+        found.append(
+            ((filled - lost) ** 2, lost**2, variance + (SCALES.share * filled) ** 2, (top / rail) ** 4)
+        )
     return sorted(found, key=lambda peak: -peak[3])[:PEAKS]
 
 
@@ -264,7 +268,7 @@ def test_hidden_peaks_are_filled_one_by_one():
     ok, rail = np.ones(400, bool), 6.0
     ok[120:130] = False
     told = filter_of(PHI), 0.5 * rng.normal(size=400), rng.uniform(0.3, 3.0, size=400)
-    found = HIDDEN(*map(jnp.asarray, (x, ok, rail, *told)))
+    found = HIDDEN(*map(jnp.asarray, (x, ok, rail, *told)), SCALES)
     seen = []
     for length, excess, harmful in zip(NODES, *found, strict=True):
         each = [hidden_errors(x, ok, rail, told, length, way) for way in (1.0, -1.0)]

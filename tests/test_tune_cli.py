@@ -34,6 +34,16 @@ def test_what_is_tuned_is_a_configuration(walk, tmp_path, capsys):
     assert main([*arguments, "--config", str(out)]) == 0
 
 
+def test_scales_of_the_prior_are_a_configuration_too(walk, tmp_path, capsys):
+    out = tmp_path / "prior.toml"
+    assert main(["tune", str(walk), "-o", str(out), "--prior", "--steps", "3", "--strict"]) == 0
+    assert "misfit of a gap" in capsys.readouterr().out
+    found, before = load_config(out), load_config()
+    assert found.saturation.prior_share != before.saturation.prior_share
+    assert found.saturation.prior_width != before.saturation.prior_width
+    assert found.noise == before.noise
+
+
 def test_a_split_and_the_truth_are_found(walk, tmp_path, capsys):
     out = tmp_path / "noise.toml"
     split = ["--split", str(walk.with_name("splits.toml")), "train"]
@@ -55,6 +65,7 @@ def test_a_split_and_the_truth_are_found(walk, tmp_path, capsys):
         (["--split", "{folder}/splits.toml", "lost"], "'run' of 'lost' is 0 files"),
         (["--split", "{walk}", "train"], "no split can be read"),
         (["{folder}/walk_truth.csv", "--truth"], "no truth beside it"),
+        (["{walk}", "--prior", "--truth"], "leave out --truth or --prior"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(walk, tmp_path, monkeypatch, capsys, arguments, sentence):

@@ -44,6 +44,10 @@ def tune_command(
             "--truth", help="fit the positions in NAME_truth.csv beside NAME.csv, or in a PyShoe file"
         ),
     ] = False,
+    prior: Annotated[
+        bool,
+        typer.Option("--prior", help="learn the scales of the signal prior of `map`, not the noise"),
+    ] = False,
     steps: Annotated[int, typer.Option(help="of Adam")] = 40,
     config: ConfigPath = None,
     format: Format = "auto",
@@ -56,7 +60,7 @@ def tune_command(
     quiet: Quiet = False,
     strict: Strict = False,
 ) -> None:
-    """Learn how noisy a sensor is and how still it rests from recordings, and write it as a configuration."""
+    """Learn noise and how still a sensor rests, or what gaps lose, from recordings; write it as a configuration."""
     from jaxsat.config import config_toml, load_config
     from jaxsat.present.text import tuning_text
 
@@ -64,6 +68,8 @@ def tune_command(
     paths = [*(recordings or []), *(_listed(*split) if split else [])]
     if not paths:
         raise InputError("tune: no recording is given; name some, or a --split.")
+    if prior and truth:
+        raise InputError("tune: positions say nothing of the prior; leave out --truth or --prior.")
     settings = load_config(config)
     measured = [
         read_recording(path, format, rate, gyr_unit, acc_unit, rests, sensor, negate_acc) for path in paths
@@ -71,27 +77,36 @@ def tune_command(
     use_compilation_cache()
     from jaxsat.studies.boards import write_whole
     from jaxsat.studies.metrics import load_truth
-    from jaxsat.studies.tuning import noise_trial, tune_noise
+    from jaxsat.studies.tuning import noise_trial, prior_trials, tune_noise, tune_prior
 
-    trials = [
-        noise_trial(one, settings, load_truth(path) if truth else None)
-        for one, path in zip(measured, paths, strict=True)
-    ]
     with progress_bar(quiet) as progress:
         report = (lambda done, total: progress("steps", done, total)) if progress else (lambda *_: None)
-        tuned = tune_noise(trials, settings.noise, against_truth=truth, steps=steps, report=report)
-    noise, loss = (settings.noise, tuned.noise), (tuned.before, tuned.after)
-    text = tuning_text(noise, loss, truth, [path.name for path in paths])
-    found = settings.model_copy(update={"noise": tuned.noise})
+        if prior:
+            clipped = [trial for one in measured for trial in prior_trials(one, settings)]
+            tuned = tune_prior(clipped, settings.saturation, steps=steps, report=report)
+            pair, warnings = (settings.saturation, tuned.saturation), []
+            found = settings.model_copy(update={"saturation": tuned.saturation})
+        else:
+            trials = [
+                noise_trial(one, settings, load_truth(path) if truth else None)
+                for one, path in zip(measured, paths, strict=True)
+            ]
+            tuned = tune_noise(trials, settings.noise, against_truth=truth, steps=steps, report=report)
+            pair, found = (settings.noise, tuned.noise), settings.model_copy(update={"noise": tuned.noise})
+            warnings = _measured_warnings(measured, trials)
+    text = tuning_text(pair, (tuned.before, tuned.after), truth, [path.name for path in paths])
     head = "".join(f"# {line}\n" for line in text.splitlines())
     write_whole(out, f"{head}\n{config_toml(found)}")
+    tell(f"{text}\nwritten: {out}", warnings, quiet, strict)
+
+
+def _measured_warnings(measured, trials) -> list[str]:
     saturated = {one.name: int((t.trial.sign != 0).sum()) for one, t in zip(measured, trials, strict=True)}
-    warnings = [
+    return [
         f"{name}: {count} saturated values count as measured; learn from recordings that do not saturate."
         for name, count in saturated.items()
         if count
     ]
-    tell(f"{text}\nwritten: {out}", warnings, quiet, strict)
 
 
 def _check_out(out: Path) -> None:

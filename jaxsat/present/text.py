@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from jaxsat.attitude import Orientation
-from jaxsat.config import Noise
+from jaxsat.config import Noise, Saturation
 from jaxsat.pipeline import Estimate
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.formats import ANGULAR_RATE, SPECIFIC_FORCE
@@ -159,15 +159,21 @@ def sweep_text(table: pd.DataFrame, path: Path) -> str:
 
 
 def tuning_text(
-    noise: tuple[Noise, Noise], loss: tuple[float, float], against_truth: bool, names: Sequence[str]
+    found: tuple[Noise, Noise] | tuple[Saturation, Saturation],
+    loss: tuple[float, float],
+    against_truth: bool,
+    names: Sequence[str],
 ) -> str:
-    """What `jaxsat tune` prints, and writes above what it found: noise and loss before and after."""
-    units = {"gyr_density": "rad/s/√Hz", "acc_density": "m/s²/√Hz", "rest_velocity_sd": "m/s"}
+    """What `jaxsat tune` prints, and writes above what it found: noise or prior, and loss, before and after."""
+    units = {"prior_width": "rails", "prior_share": "of what is expected"}
+    if isinstance(found[0], Noise):
+        units = {"gyr_density": "rad/s/√Hz", "acc_density": "m/s²/√Hz", "rest_velocity_sd": "m/s"}
     rows = [["", "before", "after", ""]]
     for name, unit in units.items():
-        rows.append([name, *(f"{getattr(one, name):.4g}" for one in noise), unit])
+        rows.append([name, *(f"{getattr(one, name):.4g}" for one in found), unit])
     if against_truth:
         rows.append(["position RMSE", *(f"{np.sqrt(one):.4g}" for one in loss), "m"])
     else:
-        rows.append(["misfit of a rest", *(f"{one:.4f}" for one in loss), "-log p"])
+        what = "a rest" if isinstance(found[0], Noise) else "a gap"
+        rows.append([f"misfit of {what}", *(f"{one:.4f}" for one in loss), "-log p"])
     return f"tuned on {plural(len(names), 'recording')}: {', '.join(names)}\n" + columns(rows)

@@ -27,7 +27,7 @@ from jaxsat.saturation.layout import (
     padded_sizes,
 )
 from jaxsat.saturation.methods import Options, SegmentFill, solve_segment
-from jaxsat.saturation.prior import SignalPrior, blank, learn
+from jaxsat.saturation.prior import Scales, SignalPrior, blank, learn
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.rests import Segments
 
@@ -162,11 +162,11 @@ def solve_segments(
     return jax.vmap(solve)(states, covariances, table, departure, arrival)
 
 
-def signal_prior(trial: Trial) -> SignalPrior:
+def signal_prior(trial: Trial, scales: Scales) -> SignalPrior:
     """What the unsaturated samples of a recording say of its saturated ones."""
     moving = ~jnp.asarray(trial.rows.rest)
     signal, sign, clean = map(jnp.asarray, (trial.signal, trial.sign, trial.clean))
-    return learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0])
+    return learn(signal, sign, clean, moving, jnp.asarray(trial.period)[0], scales)
 
 
 def calibrate_trial(
@@ -238,7 +238,7 @@ def trace_search(
     """What compiles the programs of `compensate_parallel` (together) or `compensate_sequential` that take longest."""
     size, prior = filtered_size(trial.rows), None
     if options.method == "map":
-        prior = blank(len(trial.period))
+        prior = blank(len(trial.period), options.scales)
     here, counts = trial.calibrated(Calibration.none()), count_values(trial.sign, segments)
     programs = {}
     for mine, sizes in solved_together(*counts) if together else [_one_by_one(*counts)]:
@@ -252,7 +252,7 @@ def trace_search(
 
 def learn_prior(trial: Trial, options: Options) -> SignalPrior | None:
     """What a search takes from the signals alone: the signal prior, for methods that have one."""
-    return _prior(trial) if options.method == "map" else None
+    return _prior(trial, options.scales) if options.method == "map" else None
 
 
 def compensate_parallel(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.saturation.gap_shapes import peak, shape_value
+from jaxsat.saturation.prior import Scales
 from jaxsat.saturation.segment import Segment, condense, value_and_root, value_gradient_root
 from jaxsat.saturation.solvers import (
     Box,
@@ -104,6 +105,8 @@ class Options(eqx.Module):
     tolerance: Float[Array, ""]
     calibration_sd: Float[Array, "9"] | None
     """Prior sd of the constants of `Calibration`; None where none is estimated."""
+    scales: Scales
+    """Of the prior of `map`."""
 
 
 def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options) -> SegmentFill:

@@ -9,8 +9,10 @@ once, so its mean is linear in what the other channels do about that sample (`be
 With innovations e = a ∗ x − m of variance σ² the energy ½ Σ e²/σ² is quadratic in the saturated values, of
 precision Ω_ij = Σ_t a_{t−i} a_{t−j}/σ²_t. Unlike a pure difference penalty the prior is proper: what a gap lost on
 average is also known to be a fraction of the rail, which only long gaps feel. And what it predicts is known to a
-share only (`SHARE`).
+share only (`Scales`).
 """
+
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -22,7 +24,8 @@ from jaxsat.inertial.dense import inverse_positive, solve_positive
 from jaxsat.saturation.experience import NODES, Experience, habit, length_weights, with_habit
 
 # Terms that predict the second difference. Of 1, 2, 4 and 6 terms four filled the long gaps of the PyShoe walks of
-# the list `clip` best (clipped at 250 °/s) and two the short ones (350 °/s), compared before `WIDTH` was per gap.
+# the list `clip` best (clipped at 250 °/s) and two the short ones (350 °/s), compared before
+# `Scales.width` was per gap.
 ORDER = 4
 # All this is learned from samples within so many seconds of a gap of its channel: movement that is as fast as what
 # was lost, not the average of rest and movement.
@@ -31,21 +34,26 @@ REACH = 0.2
 MOMENT, LEAST_ROUGHNESS = 0.01, 0.01
 # Windows without which the channel's other movement is taken too.
 FEWEST = 100
-# Root mean square of what a gap lost (δ), in rails.
-WIDTH = 0.5
-# sd of what a gap lost, as a share of what the prior says that it lost; besides the sd that the prior claims, which
-# rests on the movement that is left being as lively as what was lost. On the walks of the list `clip`, clipped at
-# 350, 250 and 200 °/s, half of the gaps lost at least 30 to 100 % more or less than a prior of one channel says.
-SHARE = 0.3
 # A hidden peak stands above so much of the rail at least; of each length and direction the highest are filled.
 LEAST_LEVEL, PEAKS = 0.25, 16
 # As if so many hidden peaks at the rail had been as far off as the prior says.
 CREDIT = 2.0
 
 
+class Scales(eqx.Module):
+    """How far beyond what is learned of a recording the prior goes; `jaxsat tune --prior` learns both."""
+
+    width: Float[Array, ""]
+    """Root mean square of what a gap lost (δ), in rails."""
+    share: Float[Array, ""]
+    """sd of what a gap lost, as a share of what the prior says of it; besides the sd that the prior claims, which
+    rests on the movement that is left being as lively as what was lost."""
+
+
 class SignalPrior(eqx.Module):
     """The prior of six channels."""
 
+    scales: Scales
     predictor: Float[Array, "6 K"]
     """a: of a sample and of those before it, what makes an innovation."""
     mean: Float[Array, "N 6"]
@@ -61,13 +69,13 @@ class SignalPrior(eqx.Module):
     """What the search before taught; with none of it at first."""
 
 
-def blank(samples: int) -> SignalPrior:
+def blank(samples: int, scales: Scales) -> SignalPrior:
     """Of the shapes of one that is learned from so many samples."""
     predictor, by_sample, by_length = (
         jnp.asarray(np.zeros(shape)) for shape in ((6, ORDER + 3), (samples, 6), (6, len(NODES)))
     )
     harmful = jnp.asarray(np.zeros((6, len(NODES)), bool))
-    return SignalPrior(predictor, by_sample, by_sample, by_length, harmful, Experience.none())
+    return SignalPrior(scales, predictor, by_sample, by_sample, by_length, harmful, Experience.none())
 
 
 def learn(
@@ -76,17 +84,18 @@ def learn(
     clean: Bool[Array, "N 6"],
     moving: Bool[Array, "N"],
     period: Float[Array, ""],
+    scales: Scales,
 ) -> SignalPrior:
     """Conditional maximum likelihood from windows of unsaturated, moving samples."""
     reach = jnp.asarray(REACH / period, int)
     near = jax.vmap(lambda s: _near(s != 0, reach), in_axes=1, out_axes=1)(sign)
     moment = jnp.maximum(jnp.round(MOMENT / period), 1.0).astype(int)
     rough = roughness(signal, clean, near & clean & moving[:, None], moment)
-    channels = jax.vmap(_learn_channel, in_axes=1)
+    channels = jax.vmap(partial(_learn_channel, scales), in_axes=1)
     predictor, mean, weight, excess, harmful = channels(
         signal, sign != 0, clean & moving[:, None], near, rough, beside(signal)
     )
-    return SignalPrior(predictor, mean.T, weight.T, excess, harmful, Experience.none())
+    return SignalPrior(scales, predictor, mean.T, weight.T, excess, harmful, Experience.none())
 
 
 def _near(saturated: Bool[Array, "N"], reach: Int[Array, ""]) -> Bool[Array, "N"]:
@@ -144,7 +153,7 @@ def beside(signal: Float[Array, "N 6"]) -> Float[Array, "N 6 R"]:
     return others.reshape(len(signal), 6, -1)
 
 
-def _learn_channel(x, saturated, ok, near, rough, others):
+def _learn_channel(scales: Scales, x, saturated, ok, near, rough, others):
     second = x[2:] - 2.0 * x[1:-1] + x[:-2]
     count = len(second) - ORDER
     lagged = [second[ORDER - lag : ORDER - lag + count] for lag in range(ORDER + 1)]
@@ -167,7 +176,7 @@ def _learn_channel(x, saturated, ok, near, rough, others):
     predictor = jnp.convolve(jnp.array([1.0, -2.0, 1.0]), jnp.concatenate([jnp.ones(1), -found[:ORDER]]))
     mean, weight = others @ found[ORDER:], 1.0 / (innovation * rough)
     rail = jnp.max(jnp.where(saturated, jnp.abs(x), 0.0))
-    return predictor, mean, weight, *hidden_peaks(x, ok, rail, predictor, mean, weight)
+    return predictor, mean, weight, *hidden_peaks(x, ok, rail, predictor, mean, weight, scales)
 
 
 def hidden_peaks(
@@ -177,6 +186,7 @@ def hidden_peaks(
     predictor: Float[Array, "K"],
     mean: Float[Array, "N"],
     weight: Float[Array, "N"],
+    scales: Scales,
 ) -> tuple[Float[Array, "L"], Bool[Array, "L"]]:
     """Masked cross-validation on a channel: `SignalPrior.excess` and `SignalPrior.harmful`.
 
@@ -209,11 +219,11 @@ def hidden_peaks(
                 own = jnp.broadcast_to(predictor, (length, reach + 1))
                 after = (y[place[:, : reach + 1]] for y in told)
                 within, slope = _energy(place[:, 0], jnp.zeros_like(place[:, 0]), own, cut[place], *after)
-                pull = 1.0 / ((WIDTH * rail) ** 2 * length)
+                pull = 1.0 / ((scales.width * rail) ** 2 * length)
                 toll = solve_positive(within + pull * jnp.eye(length), jnp.ones(length))
                 filled = jnp.maximum(-toll @ slope, 0.0)
                 lost = jnp.sum(true - cut)
-                return (filled - lost) ** 2, lost**2, jnp.sum(toll) + (SHARE * filled) ** 2
+                return (filled - lost) ** 2, lost**2, jnp.sum(toll) + (scales.share * filled) ** 2
 
             errors, losses, claimed = jax.vmap(fill)(first, level[first])
             counts = jnp.where(worth > 0.0, worth / jnp.where(worth > 0.0, claimed, 1.0), 0.0)
@@ -298,10 +308,29 @@ def quadratic_form(
     within, slope = _energy(sample, channel, predictor, window, prior.mean[after], prior.weight[after])
     rail = jnp.maximum(jnp.abs(window[:, reach]), 1e-9)
     # Values of a gap go together: what is known of their mean must not be counted once for each.
-    pull = 1.0 / ((WIDTH * rail) ** 2 * jnp.maximum(length, 1.0))
+    pull = 1.0 / ((prior.scales.width * rail) ** 2 * jnp.maximum(length, 1.0))
     real = sign != 0.0
     precision = jnp.where(real[:, None] & real[None], within * sign[:, None] * sign[None], 0.0)
     return precision + jnp.diag(jnp.where(real, pull, 1.0)), jnp.where(real, sign * slope, 0.0)
+
+
+def by_signal(
+    prior: SignalPrior,
+    signal: Float[Array, "N 6"],
+    sample: Int[Array, "m"],
+    channel: Int[Array, "m"],
+    sign: Float[Array, "m"],
+    gap: Int[Array, "m"],
+) -> tuple[Float[Array, "m"], Float[Array, "m m"]]:
+    """Mean and covariance of some saturated values by the signal alone; arguments as of `of_values`."""
+    length = jnp.zeros_like(sign).at[gap].add(jnp.abs(sign))[gap]
+    precision, slope = quadratic_form(prior, signal, sample, channel, sign, length)
+    within = inverse_positive(precision)
+    mean = -within @ slope
+    # What a gap lost is known to a share only, and its values are too much or too little together.
+    common = jnp.where(sign != 0.0, jnp.maximum(mean, 0.0), 0.0) * prior.scales.share
+    together = gap[:, None] == gap[None]
+    return mean, within + jnp.where(together, common[:, None] * common[None], 0.0)
 
 
 def of_values(
@@ -315,13 +344,7 @@ def of_values(
     """The prior of some saturated values, as in `quadratic_form`; gap: a number of the gap that each lies in."""
     real = sign != 0.0
     length = jnp.zeros_like(sign).at[gap].add(jnp.abs(sign))[gap]
-    precision, slope = quadratic_form(prior, signal, sample, channel, sign, length)
-    within = inverse_positive(precision)
-    mean = -within @ slope
-    # What a gap lost is known to a share only, and its values are too much or too little together.
-    fill = jnp.where(real, jnp.maximum(mean, 0.0), 0.0)
-    together = gap[:, None] == gap[None]
-    covariance = within + jnp.where(together, SHARE**2 * fill[:, None] * fill[None], 0.0)
+    mean, covariance = by_signal(prior, signal, sample, channel, sign, gap)
     # What hidden peaks of about that length say.
     near = length_weights(length)
     excess = jnp.where(real, jnp.sum(near * prior.excess[channel], axis=1), 1.0)

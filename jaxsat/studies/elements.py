@@ -269,7 +269,7 @@ def score(
         found["standard"] = compared(path, signal)
     bare = None if wanted is not None or not options else _table(case, trial)
     for option, passes in zip(options, sweeps, strict=True):
-        first_prior = signal_prior(trial) if option.method == "map" else None
+        first_prior = signal_prior(trial, option.scales) if option.method == "map" else None
 
         def once(before, _, option=option):
             filled, extra, _, calibration, prior = before

@@ -20,6 +20,7 @@ from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.compensate import arrival_table, filter_trial, signal_prior
 from jaxsat.saturation.gap_shapes import Edges, edge_slope, peak, shape_value
 from jaxsat.saturation.layout import Sizes, Trial, gather
+from jaxsat.saturation.prior import Scales
 from jaxsat.saturation.segment import Condensed, Segment, condense, value_gradient_root
 from jaxsat.saturation.solvers import Box, projected_gauss_newton, projected_gradient
 from jaxsat.signals.recording import Recording
@@ -117,20 +118,21 @@ def problem_of(recording: Recording, config: Config, method: str) -> tuple[Prepa
     prepared = prepare(recording, config)
     segments = prepared.segments
     table = arrival_table(prepared.trial, segments)[0]
-    segment, condensed = _gathered(
-        prepared.trial, segments.departure[:1], segments.arrival[:1], table, method == "map"
-    )
     options = search_options(config, method)
+    scales = options.scales if method == "map" else None
+    segment, condensed = _gathered(
+        prepared.trial, segments.departure[:1], segments.arrival[:1], table, scales
+    )
     gravity = jnp.asarray(prepared.trial.gravity)
     return prepared, Problem(segment, condensed, gravity, options.tolerance, options.max_iterations)
 
 
 @compiled
-def _gathered(trial: Trial, departure, arrival, table, learned: bool) -> tuple[Segment, Condensed]:
+def _gathered(trial: Trial, departure, arrival, table, scales: Scales | None) -> tuple[Segment, Condensed]:
     trial, departure, arrival = jax.tree.map(jnp.asarray, trial), departure[0], arrival[0]
     filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
     state, covariance, _ = jax.tree.map(lambda x: x[departure], filtered)
-    known = signal_prior(trial) if learned else None
+    known = None if scales is None else signal_prior(trial, scales)
     segment, _ = gather(trial, departure, arrival, state, covariance, table, SIZES, known)
     return segment, condense(segment)
 
