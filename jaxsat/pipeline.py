@@ -124,7 +124,8 @@ def search_options(config: Config, method: str) -> Options:
 
 
 def prior_scales(config: Config) -> Scales:
-    return Scales(jnp.asarray(config.saturation.prior_width), jnp.asarray(config.saturation.prior_share))
+    chosen = config.saturation
+    return Scales(jnp.asarray(chosen.prior_width, float), jnp.asarray(chosen.prior_share, float))
 
 
 def constants_sd(config: Config) -> Float[Array, "9"] | None:
@@ -156,18 +157,18 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     with Beside(2) as beside:
         programs = trace_search(searched, segments, options, together=together) if options else []
         compiling = [beside.submit(program) for program in programs]
-        learning = options and beside.submit(learn_prior, searched, options)
+        learning = beside.submit(learn_prior, searched, options) if options else None
         calibration = calibrate_by_rests(searched, config)
         clock.lap("calibration")
         sure = trial.calibrated(calibration)
         ignoring = beside.submit(_smooth, sure, config)
         compensated = None
-        if options:
+        if options is not None and learning is not None:
 
-            def learned():
+            def learned(prior=learning):
                 for program in compiling:
                     program.result()
-                return learning.result()
+                return prior.result()
 
             report = partial(progress, "segments")
             given = searched, segments, options, calibration, learned

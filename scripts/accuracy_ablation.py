@@ -17,6 +17,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from accuracy import IGNORANT, clip
@@ -30,7 +31,7 @@ from jaxsat.pipeline import Estimate, estimate
 from jaxsat.signals.readers import read
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import find_segments
-from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
+from jaxsat.studies.metrics import geometric_mean_ratio, load_pyshoe_truth, position_rmse
 
 Signal = Float[np.ndarray, "N 6"]
 
@@ -71,7 +72,7 @@ def of_gaps(found: Estimate, from_gap) -> Signal:
 
 def turned(found: Estimate, truth: Signal, vertical: bool) -> Signal:
     """The filled signal without what it turns too far over each motion, about the vertical or the horizontal axes."""
-    attitude = np.asarray(jax.vmap(quat_to_matrix)(found.trajectory.q_nb))
+    attitude = np.asarray(jax.vmap(quat_to_matrix)(jnp.asarray(found.trajectory.q_nb)))
     away = np.where(found.saturated, found.filled - truth, 0.0)[:, :3]
     error = np.einsum("nij,nj->ni", attitude, away)
     wanted = np.array([not vertical, not vertical, vertical])
@@ -149,21 +150,29 @@ def page(table: pd.DataFrame) -> Iterator[str]:
     """The tables, errors in metres, and of the saturated trials what `map` leaves of the error of `standard`."""
     yield "# What holds the errors that are left"
     yield "Written by `python scripts/accuracy_ablation.py ../shared/data`, whose head says what is compared."
-    if len(part := table[table["part"] == "clipped"]):
-        errors = part.pivot(index="case", columns="variant", values="error")
-        yield "## Clipped in software: RMS to the own unclipped path (m)"
-        yield markdown(errors.loc[part["case"].unique(), part["variant"].unique()].reset_index())
-    if len(part := table[table["part"] == "saturated"]):
-        method, logarithms = part["case"].str.split(": ").str[-1], np.log(part["error"])
-        columns = {}
-        for name in ("standard", "map"):
-            mine = part["variant"][method == name]
-            columns[f"mean of {name} (m)"] = part["error"].groupby(mine, sort=False).mean()
-            columns[name] = logarithms.groupby(mine, sort=False).mean()
-        shares = pd.DataFrame(columns)
-        shares["map over standard (geometric mean)"] = np.exp(shares.pop("map") - shares.pop("standard"))
-        yield "## Saturated PyShoe trials: RMS to Vicon, aligned"
-        yield markdown(shares.reset_index())
+    for part, rows in table.groupby("part", sort=False):
+        if part == "clipped":
+            errors = rows.pivot(index="case", columns="variant", values="error")
+            order = [list(dict.fromkeys(rows[name])) for name in ("case", "variant")]
+            yield "## Clipped in software: RMS to the own unclipped path (m)"
+            yield markdown(errors.loc[order[0], order[1]].reset_index())
+        else:
+            yield "## Saturated PyShoe trials: RMS to Vicon, aligned"
+            yield markdown(pd.DataFrame(shares(rows)))
+
+
+def shares(rows: pd.DataFrame) -> Iterator[dict]:
+    for variant, mine in rows.groupby("variant", sort=False):
+        standard, found = (
+            mine.loc[mine["case"].str.endswith(f": {method}"), "error"].to_numpy()
+            for method in ("standard", "map")
+        )
+        yield {
+            "variant": variant,
+            "mean of standard (m)": float(standard.mean()),
+            "mean of map (m)": float(found.mean()),
+            "map over standard (geometric mean)": geometric_mean_ratio(found, standard),
+        }
 
 
 PARTS = {"clipped": clipped, "saturated": saturated}
@@ -180,7 +189,8 @@ def main() -> int:
     path = arguments.output / "ablation.csv"
     if path.exists():
         before = pd.read_csv(path)
-        table = pd.concat([before[~before["part"].isin(arguments.only)], table], ignore_index=True)
+        kept = before.loc[~before["part"].isin(arguments.only)].to_dict("records")
+        table = pd.DataFrame([*kept, *table.to_dict("records")])
     arguments.output.mkdir(parents=True, exist_ok=True)
     table.to_csv(path, index=False, float_format="%.4g")
     (arguments.output / "ablation.md").write_text("\n\n".join(page(table)) + "\n")

@@ -70,7 +70,9 @@ def objective_vs_strapdown() -> Iterator[Row]:
 
     condensed = jax.jit(jax.vmap(segment))(jax.tree.map(jnp.asarray, batch.trials))
     delta = jnp.ones((256, batch.sizes.values))
-    evaluate = compiled(jax.vmap(lambda each, g: value_gradient_root(*each, g)[:2], in_axes=(0, None)))
+    evaluate = compiled(
+        jax.vmap(lambda each, g: value_gradient_root(each[0], each[1], g)[:2], in_axes=(0, None))
+    )
     gravity = jnp.asarray(GRAVITY)
     run = side_by_side(lambda each: evaluate(each, gravity), (delta, condensed), -(-256 // PART))
     bare = strapdown_seconds()

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
+from jaxsat.inertial.programs import keep_traces
 from jaxsat.pipeline import Estimate, estimate
 from jaxsat.preparation import LATEST_FIRST_REST
 from jaxsat.present.summary import summarise
@@ -343,7 +344,7 @@ def test_what_is_learned_of_the_sensors_is_said():
 @pytest.mark.parametrize(
     "settings", [{"method": "map"}, {"saturation.segments": "sequential"}, {"height.mode": "zero"}]
 )
-def test_the_search_is_compiled_ahead_for_what_it_is_called_with(settings, monkeypatch):
+def test_the_search_is_compiled_ahead_for_what_it_is_called_with(settings, monkeypatch, tmp_path):
     """Or it would be compiled twice: the call finds a program by the shapes, types and settings of its arguments."""
     seen, solve = {}, compensate._solve
 
@@ -362,7 +363,11 @@ def test_the_search_is_compiled_ahead_for_what_it_is_called_with(settings, monke
     monkeypatch.setattr(compensate, "trace_ahead", ahead)
     monkeypatch.setattr(compensate, "_solve", call)
     recording, _ = bar(0, gyr_rail=7.5)
-    estimate(recording, load_config(None, **BAR, **{"method": "direct", **settings}))
+    keep_traces(tmp_path)
+    try:
+        estimate(recording, load_config(None, **BAR, **{"method": "direct", **settings}))
+    finally:
+        keep_traces(None)
     assert seen["ahead"] == seen["called"]
 
 

@@ -77,7 +77,8 @@ def tune_command(
     use_compilation_cache()
     from jaxsat.studies.boards import write_whole
     from jaxsat.studies.metrics import load_truth
-    from jaxsat.studies.tuning import noise_trial, prior_trials, tune_noise, tune_prior
+    from jaxsat.studies.tuning import noise_trial, tune_noise
+    from jaxsat.studies.tuning_prior import prior_trials, tune_prior
 
     with progress_bar(quiet) as progress:
         report = (lambda done, total: progress("steps", done, total)) if progress else (lambda *_: None)
