@@ -1,4 +1,4 @@
-"""Scales of the signal prior by gradient: those under which what recordings lose when they are clipped is likeliest."""
+"""Scales of the signal prior by gradient: those under which what recordings lose, clipped in software, is likely."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
