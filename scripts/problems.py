@@ -100,23 +100,24 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
     )
 
 
-def side_by_side(solve: Callable, arguments: Any, parts: int) -> Callable:
-    """solve(arguments) by so many parts of their leading axis, on all cores as a sweep uses them."""
+# On a CPU as a sweep does it: on each core a part, none so large that it leaves the cache.
+PART = 1024 if jax.default_backend() == "gpu" else 128
+
+
+def side_by_side(solve: Callable, arguments: Any) -> Callable:
+    """solve(arguments) by parts of their leading axis, on all cores as a sweep uses them: what each gives."""
     leaves, structure = jax.tree.flatten(arguments)
+    parts = -(-len(leaves[0]) // PART)
     split = zip(*(np.array_split(leaf, parts) for leaf in leaves), strict=True)
     given = [jax.device_put(jax.tree.map(jnp.asarray, structure.unflatten(part))) for part in split]
     if parts == 1:
-        return lambda: solve(given[0])
+        return lambda: [solve(given[0])]
     cores = Beside(usable_cores())
     return lambda: list(cores.map(lambda part: jax.block_until_ready(solve(part)), given))
 
 
-def run_direct(batch: Batch, whole: bool, parts: int = 1) -> Callable:
-    return side_by_side(compiled(jax.vmap(lambda trial: direct(trial, batch, whole))), batch.trials, parts)
-
-
-# On a CPU as a sweep does it: on each core a part, none so large that it leaves the cache.
-PART = 1024 if jax.default_backend() == "gpu" else 128
+def run_direct(batch: Batch, whole: bool) -> Callable:
+    return side_by_side(compiled(jax.vmap(lambda trial: direct(trial, batch, whole))), batch.trials)
 
 
 @cache
