@@ -98,28 +98,35 @@ def clipped_cases(data: Path) -> Iterator[tuple[str, Recording, float]]:
         yield from ((name, walk, rail) for rail in (350, 250))
 
 
+def refilled(found: Estimate, true: Signal, rest) -> dict[str, tuple[Signal, np.ndarray]]:
+    """Signals and rests to make a path of; rest: of the unclipped recording."""
+    filled = found.filled
+
+    def short(inside: slice, channel: int) -> float:
+        """By how much the fill of a gap falls short of the truth, on average."""
+        return float(np.mean(true[inside, channel] - filled[inside, channel]))
+
+    signals = {
+        "nothing filled": found.recording.signal,
+        "as filled": filled,
+        "sums of gaps true": of_gaps(found, lambda inside, c: filled[inside, c] + short(inside, c)),
+        "shapes of gaps true": of_gaps(found, lambda inside, c: true[inside, c] - short(inside, c)),
+        "turns about the vertical true": turned(found, true, vertical=True),
+        "turns about the horizontal true": turned(found, true, vertical=False),
+    }
+    return {
+        **{what: (signal, found.rest) for what, signal in signals.items()},
+        "rests of the unclipped recording": (filled, rest),
+        "all filled as it was": (np.where(found.saturated, true, filled), found.rest),
+    }
+
+
 def clipped(data: Path) -> list[dict]:
     rows = []
     for name, recording, rail in clipped_cases(data):
         whole = estimate(recording, load_config(None, method="standard"))
         found = estimate(clip(recording, gyr=rail), load_config(None, method="map"))
-        true, filled = recording.signal, found.filled
-        variants = {
-            "nothing filled": (found.recording.signal, found.rest),
-            "as filled": (filled, found.rest),
-            "sums of gaps true": (
-                of_gaps(found, lambda g, c: filled[g, c] + np.mean(true[g, c] - filled[g, c])),  # noqa: B023
-                found.rest,
-            ),
-            "shapes of gaps true": (
-                of_gaps(found, lambda g, c: true[g, c] - np.mean(true[g, c] - filled[g, c])),  # noqa: B023
-                found.rest,
-            ),
-            "turns about the vertical true": (turned(found, true, vertical=True), found.rest),
-            "turns about the horizontal true": (turned(found, true, vertical=False), found.rest),
-            "rests of the unclipped recording": (filled, whole.rest),
-            "all filled as it was": (np.where(found.saturated, true, filled), found.rest),
-        }
+        variants = refilled(found, recording.signal, whole.rest)
         for what, (signal, rest) in variants.items():
             made = path(found.recording, signal, rest)
             error = position_rmse(made.trajectory.position, whole.trajectory.position, align=False)

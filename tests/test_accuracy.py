@@ -180,3 +180,10 @@ def test_the_path_of_a_signal_that_is_true_again_is_the_unclipped_one(board):
     assert np.linalg.norm(off) > 0.1
     true = ablation.of_gaps(found, lambda inside, channel: recording.signal[inside, channel])
     np.testing.assert_array_equal(true, again)
+    made = ablation.refilled(found, recording.signal, whole.rest)
+    for what, true in (("sums of gaps true", np.sum), ("shapes of gaps true", np.diff)):
+        signal = made[what][0]
+        for inside, channel in ablation.gaps_of(found):
+            np.testing.assert_allclose(true(signal[inside, channel]), true(recording.signal[inside, channel]))
+        assert not np.allclose(signal, again)
+    np.testing.assert_array_equal(made["all filled as it was"][0], again)

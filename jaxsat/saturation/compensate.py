@@ -245,7 +245,7 @@ def trace_search(
         lanes = _lanes(len(mine)) if together else 1
         lane = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)
         lane = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), lane)
-        if (lanes, sizes) not in programs:
+        if len(mine) and (lanes, sizes) not in programs:
             programs[lanes, sizes] = trace_ahead(_solve, here, *lane, prior, sizes, options)
     return list(programs.values())
 
