@@ -3,6 +3,7 @@
 The public names are loaded when they are first used, so that importing the package costs nothing.
 """
 
+import os
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,22 @@ if TYPE_CHECKING:
     from jaxsat.studies.motions import MOTIONS
     from jaxsat.studies.simulate import Sensor, simulate
     from jaxsat.studies.sweep import sweep
+
+# On a CPU XLA makes each of the dozens of operations in a loop a program of its own, and for one trial starting them
+# takes longer than what they compute. Loops whose steps touch fewer bytes than this become one program, and a filter
+# takes a quarter of the time.
+SMALL_LOOP = 2**17
+
+
+def _make_small_loops_one() -> None:
+    """XLA takes this for a whole process only, before its first program; a setting of the user's stays."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_extra_options" not in flags:
+        option = f"--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold={SMALL_LOOP}"
+        os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
+
+
+_make_small_loops_one()
 
 _HOME = {
     "Config": "jaxsat.config",

@@ -104,10 +104,10 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
 PART = 1024 if jax.default_backend() == "gpu" else 128
 
 
-def side_by_side(solve: Callable, arguments: Any) -> Callable:
+def side_by_side(solve: Callable, arguments: Any, part: int = PART) -> Callable:
     """solve(arguments) by parts of their leading axis, on all cores as a sweep uses them: what each gives."""
     leaves, structure = jax.tree.flatten(arguments)
-    parts = -(-len(leaves[0]) // PART)
+    parts = -(-len(leaves[0]) // part)
     split = zip(*(np.array_split(leaf, parts) for leaf in leaves), strict=True)
     given = [jax.device_put(jax.tree.map(jnp.asarray, structure.unflatten(part))) for part in split]
     if parts == 1:

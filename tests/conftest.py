@@ -1,6 +1,7 @@
 """Float64, strict promotion, a persistent compilation cache, and the folder of real recordings."""
 
 import os
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,6 +16,9 @@ os.environ.setdefault(
 
 import jax
 import pytest
+
+# What this tells XLA counts only if it comes before the first program.
+import_module("jaxsat")
 
 ROOT = Path(__file__).resolve().parents[1]
 jax.config.update("jax_enable_x64", True)

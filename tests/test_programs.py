@@ -1,5 +1,6 @@
 """Traces that are kept: the same results without running the Python code again, and never a wrong one."""
 
+import os
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jax.stages import Compiled
 from threadpoolctl import threadpool_info
 
+import jaxsat
 from jaxsat.inertial import programs
 from jaxsat.inertial.programs import (
     Beside,
@@ -222,3 +224,24 @@ def test_a_process_does_not_die_of_the_programs_that_it_has_compiled(monkeypatch
     programs.make_room()
     assert bent._cache_size() == 0 and count() < before
     assert bent(jnp.arange(7.0)) == expected
+
+
+def test_a_small_loop_is_one_program_of_the_processor():
+    if jax.default_backend() != "cpu":
+        pytest.skip("loops of a CPU are meant")
+
+    def running(x):
+        return jax.lax.scan(lambda total, each: (total + jnp.sin(each) * total.T,) * 2, jnp.zeros((9, 9)), x)
+
+    made = jax.jit(running).lower(jnp.ones((100, 9, 9))).compile().as_text()
+    assert made is not None and "xla_cpu_small_call" in made
+
+
+@pytest.mark.parametrize("own", ["", "--xla_cpu_max_isa=AVX2", "--xla_backend_extra_options=other=1"])
+def test_what_a_user_tells_xla_stays(monkeypatch, own):
+    monkeypatch.setenv("XLA_FLAGS", own)
+    jaxsat._make_small_loops_one()
+    jaxsat._make_small_loops_one()
+    flags = os.environ["XLA_FLAGS"].split()
+    assert set(own.split()) <= set(flags)
+    assert sum(flag.startswith("--xla_backend_extra_options") for flag in flags) == 1

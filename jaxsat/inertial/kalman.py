@@ -11,6 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxsat.inertial.dense import product
+
 
 class Row(eqx.Module):
     """What one scalar row h·x = z + noise did to the estimate; zeros where the row was switched off."""
@@ -71,11 +73,11 @@ def adjoint_row(
     adjoint: Adjoint, index: int, gain: Float[Array, "n"], row: Row
 ) -> tuple[Adjoint, Float[Array, ""]]:
     """Add one row to the adjoint; also returns its multiplier dJ*/dz. gain: `row`'s, of the adjoint's states."""
-    multiplier = gain @ adjoint.gradient + row.weighted
+    multiplier = jnp.sum(gain * adjoint.gradient) + row.weighted
     # CᵀΛC + h hᵀ/s with C = I − K hᵀ differs from Λ in row and column `index` only.
-    pulled = adjoint.curvature @ gain
+    pulled = product(adjoint.curvature, gain[:, None])[:, 0]
     curvature = adjoint.curvature.at[index, :].add(-pulled).at[:, index].add(-pulled)
-    curvature = curvature.at[index, index].add(gain @ pulled + row.weight)
+    curvature = curvature.at[index, index].add(jnp.sum(gain * pulled) + row.weight)
     return Adjoint(adjoint.gradient.at[index].add(-multiplier), curvature), multiplier
 
 
@@ -92,5 +94,5 @@ def condition_on_future(
 
     columns: those of the covariance that belong to the adjoint's states; on the others nothing later depends.
     """
-    smoothed = covariance - columns @ adjoint.curvature @ columns.T
-    return mean - columns @ adjoint.gradient, 0.5 * (smoothed + smoothed.T)
+    smoothed = covariance - product(product(columns, adjoint.curvature), columns.T)
+    return mean - product(columns, adjoint.gradient[:, None])[:, 0], 0.5 * (smoothed + smoothed.T)

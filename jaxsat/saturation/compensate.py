@@ -189,7 +189,7 @@ calibrate_recording = stored_jit(calibrate_trial)
 filter_recording = stored_jit(filter_trial)
 _solve = stored_jit(solve_segments)
 _prior = stored_jit(signal_prior, UNOPTIMISED)
-_experienced = stored_jit(experienced, UNOPTIMISED)
+_experienced = stored_jit(experienced)
 
 
 @stored_jit

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxsat.errors import InputError
 from jaxsat.signals.formats import GRAVITY
 from jaxsat.signals.recording import CHANNELS, Recording
+from jaxsat.signals.rests import runs
 
 START = 0.2
 """A recording starts at rest if the sensor rests this long (s)."""
@@ -26,7 +27,7 @@ def check(recording: Recording) -> list[str]:
     """Raise `InputError` for what would make an estimate meaningless; return warnings, a sentence each.
 
     Every threshold is a statement about physics, given where it is used. Units and rate are tested against
-    gravity: see `spurious_acceleration`.
+    gravity: see `spurious_accelerations`.
     """
     name = recording.name
     check_form(recording)
@@ -77,7 +78,7 @@ def _missing(recording: Recording) -> Iterator[str]:
         )
     rows = np.logical_or.reduce(missing, axis=1)
     if rows.any():
-        starts, ends = _runs(rows)
+        starts, ends = runs(rows)
         longest = int((ends - starts).argmax())
         length, at = ends[longest] - starts[longest], recording.time[starts[longest]]
         yield f"{rows.sum()} samples are missing, the longest gap has {length} at {at:.6g} s; they are interpolated."
@@ -170,43 +171,67 @@ def _check_stuck(recording: Recording) -> None:
         )
 
 
-def spurious_acceleration(recording: Recording, still: np.ndarray, scale: float) -> float | None:
-    """Acceleration that appears between still phases if the angular rate is multiplied by `scale` (m/s²).
+def spurious_accelerations(
+    recording: Recording, still: Bool[np.ndarray, "N"], scales: Float[np.ndarray, "S"]
+) -> Float[np.ndarray, "S"] | None:
+    """Acceleration that appears between still phases if the angular rate is multiplied by each scale (m/s²).
 
     From each still phase to the next, the mean nav-frame acceleration must be zero, and is if angular rate,
     specific force and sampling period fit together. The median of its size over all moves; None without any.
-    A wrong scale tilts gravity into it: `scale` compares units, and rates too, as an angle is rate × period.
+    A wrong scale tilts gravity into it: `scales` compare units, and rates too, as an angle is rate × period.
     """
     n = max(3, round(STILL_WINDOW / recording.period))
-    starts, ends = _runs(still)
+    starts, ends = runs(still)
     long = ends - starts >= n
     leave, arrive = ends[long][:-1] - n // 2, starts[long][1:] + n // 2
     if not len(leave):
         return None
-    R = attitudes(recording.gyr * scale * recording.period)
-    total = np.zeros((len(R) + 1, 3))
-    np.cumsum(np.einsum("nij,nj->ni", R, recording.acc), axis=0, out=total[1:])
-    calm = uniform_filter1d(recording.acc, n, axis=0)
-    sizes = []
-    for i, j in zip(leave, arrive, strict=True):
-        sizes.append(np.linalg.norm((total[j] - total[i]) / (j - i) - R[i] @ calm[i]))
-    return float(np.median(sizes))
+    acc, calm = recording.acc, uniform_filter1d(recording.acc, n, axis=0)[leave]
+
+    def some(scales):
+        attitude = attitudes(scales[:, None, None] * (recording.gyr * recording.period))
+        total = np.zeros((len(scales), len(acc) + 1, 3))
+        np.cumsum(_rotated(attitude, acc), axis=1, out=total[:, 1:])
+        mean = (total[:, arrive] - total[:, leave]) / (arrive - leave)[:, None]
+        return np.median(np.linalg.norm(mean - _rotated(attitude[:, leave], calm), axis=2), axis=1)
+
+    # As many at once as a few MB hold.
+    parts = -(-len(scales) * len(acc) // 2**15)
+    return np.concatenate([some(part) for part in np.array_split(scales, min(parts, len(scales)))])
 
 
-def attitudes(turns: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3 3"]:
-    """Attitude at the start of each sample, relative to the first, from rotation vectors (rad).
+def attitudes(turns: Float[np.ndarray, "S N 3"]) -> Float[np.ndarray, "S N 4"]:
+    """Attitude at the start of each sample, relative to the first, from rotation vectors (rad): quaternions, w last.
 
     Prefix products in blocks of √N, so that Python loops only 2√N times.
     """
-    side = int(np.ceil(np.sqrt(len(turns) + 1)))
-    steps = np.zeros((side * side, 3))
-    steps[1 : len(turns) + 1] = turns
-    R = Rotation.from_rotvec(steps).as_matrix().reshape(side, side, 3, 3)
+    count, n, _ = turns.shape
+    side = int(np.ceil(np.sqrt(n + 1)))
+    steps = np.zeros((side * side, count, 3))
+    steps[1 : n + 1] = turns.swapaxes(0, 1)
+    # The k-th of each block beside each other.
+    steps = steps.reshape(side, side, count, 3).swapaxes(0, 1)
+    x, y, z, w = Rotation.from_rotvec(steps.reshape(-1, 3)).as_quat().T.reshape(4, side, side, count)
+    # A quaternion is a pair of complex numbers, a + b j.
+    a, b = w + 1j * x, y + 1j * z
+
+    def product(a, b, c, d):
+        return a * c - b * d.conj(), a * d + b * c.conj()
+
     for k in range(1, side):
-        R[:, k] = R[:, k - 1] @ R[:, k]
+        a[k], b[k] = product(a[k - 1], b[k - 1], a[k], b[k])
+    start = np.ones_like(a[0]), np.zeros_like(b[0])
     for k in range(1, side):
-        R[k] = R[k - 1, -1] @ R[k]
-    return R.reshape(-1, 3, 3)[: len(turns)]
+        start[0][k], start[1][k] = product(start[0][k - 1], start[1][k - 1], a[-1, k - 1], b[-1, k - 1])
+    a, b = product(*start, a, b)
+    q = np.stack([a.imag, b.real, b.imag, a.real], axis=-1)
+    return q.swapaxes(0, 1).reshape(-1, count, 4)[:n].swapaxes(0, 1)
+
+
+def _rotated(q: Float[np.ndarray, "S n 4"], vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "S n 3"]:
+    """The same vectors at each scale."""
+    repeated = np.tile(vectors, (len(q), 1))
+    return Rotation.from_quat(q.reshape(-1, 4)).apply(repeated).reshape(len(q), -1, 3)
 
 
 def _check_units(recording: Recording) -> Iterator[str]:
@@ -217,12 +242,13 @@ def _check_units(recording: Recording) -> Iterator[str]:
     an error; too high a rate looks like a gyroscope that clips and turns too little, and is a warning.
     """
     name, still, rate = recording.name, find_still(recording), 1 / recording.period
-    as_read = spurious_acceleration(recording, still, 1.0)
-    if as_read is None or as_read < GRAVITY * TILT:
+    found = spurious_accelerations(recording, still, np.ones(1))
+    if found is None or found[0] < GRAVITY * TILT:
         return
-    no_rotation = spurious_acceleration(recording, still, 0.0) or as_read
-    scales = [*UNIT_SCALES.values(), *RATE_SCALES]
-    fits = [spurious_acceleration(recording, still, scale) or as_read for scale in scales]
+    as_read, scales = found[0], np.array([*UNIT_SCALES.values(), *RATE_SCALES])
+    others = spurious_accelerations(recording, still, np.append(scales, 0.0))
+    assert others is not None, "there were moves before"
+    *fits, no_rotation = others
     best = int(np.argmin(fits))
     if fits[best] > min(as_read, max(no_rotation, 2 * GRAVITY * TILT)) / 2:
         return
@@ -247,9 +273,3 @@ def _check_start(recording: Recording) -> Iterator[str]:
             f"the sensor moves in the first {START} s ({np.rad2deg(turned):.0f} deg, {shaken * GRAVITY:.2g} m/s²): "
             "its attitude there is found from what follows, less surely; start recordings at rest."
         )
-
-
-def _runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Starts and ends (exclusive) of the runs of True."""
-    edges = np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)

@@ -73,8 +73,8 @@ def find_rails(recording: Recording, gyr: RailSetting = "auto", acc: RailSetting
 
 def _sensor_rails(signal: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Plateau edges of the three axes of one sensor, downwards and upwards (2, 3)."""
-    found = np.array([[find_rail(s * signal[usable[:, j], j]) for j in range(3)] for s in (-1, 1)])
-    score, edge = found[..., 0], found[..., 1]
+    found = np.array([find_rails_of(signal[usable[:, j], j]) for j in range(3)])
+    score, edge = found[..., 0].T, found[..., 1].T
     sure = (score >= EVIDENCE) & np.isfinite(edge)
     # The axes of a sensor share one full scale: beside a sure rail, being likelier than not is enough.
     if sure.any():
@@ -83,13 +83,20 @@ def _sensor_rails(signal: np.ndarray, usable: np.ndarray) -> np.ndarray:
     return np.where(sure, edge, np.inf)
 
 
-def find_rail(x: Float[np.ndarray, "N"]) -> tuple[float, float]:
-    """Log-odds that the upper peaks of one channel were cut off, and the lower edge of their plateau."""
-    top = x.max(initial=0.0)
-    if len(x) < 7 or top <= 0 or top == x.min():
-        return -np.inf, np.inf
+def find_rails_of(x: Float[np.ndarray, "N"]) -> list[tuple[float, float]]:
+    """Of one channel, downwards and upwards: log-odds that its peaks were cut off, and where their plateau begins."""
+    if len(x) < 7 or x.max() == x.min():
+        return [(-np.inf, np.inf)] * 2
     noise, quantum = _noise(x), _quantum(x)
-    tops = [_Tops(x, depth * top, noise, quantum) for depth in DEPTHS]
+    return [_upper_rail(sign * x, noise, quantum) for sign in (-1, 1)]
+
+
+def _upper_rail(x: np.ndarray, noise: float, quantum: float) -> tuple[float, float]:
+    top = x.max()
+    if top <= 0:
+        return -np.inf, np.inf
+    peaks = _peaks(x)
+    tops = [_Tops(x, depth * top, noise, quantum, peaks) for depth in DEPTHS]
     scores = [t.flatness() + t.pairing() + t.levelling() for t in tops]
     best = int(np.argmax(scores))
     # A smeared plateau has next to no equal samples; where equality alone explains it, the rail is sharp.
@@ -109,8 +116,8 @@ class _Tops:
     parabola counts -1 at worst: it speaks against the rail, but a low peak may touch the band by itself.
     """
 
-    def __init__(self, x: np.ndarray, depth: float, noise: float, quantum: float):
-        self.x, self.depth, self.noise, self.quantum = x, depth, noise, quantum
+    def __init__(self, x: np.ndarray, depth: float, noise: float, quantum: float, peaks: np.ndarray):
+        self.x, self.depth, self.noise, self.quantum, self.peaks = x, depth, noise, quantum, peaks
         start, end = runs(x >= x.max() - depth)
         # Two samples are needed on either side.
         inner = (start > 1) & (end < len(x) - 1)
@@ -174,11 +181,8 @@ class _Tops:
         if k < 1:
             return 0.0
         p = np.sqrt(np.clip(4 * (self.depth + 2 * self.quantum) / step, 0.02, 1.0)).mean()
-        x, top = self.x, self.highest.max()
-        i = np.arange(2, len(x) - 2)
-        i = i[(x[i] >= x[i - 1]) & (x[i] > x[i + 1]) & (x[i] < top - self.depth)]
-        i = i[x[i] >= top - (2 * x[i] - x[i - 1] - x[i + 1]) / 8]
-        n = k + int(np.sum(~_whole(x, i)))
+        top, (level, reach) = self.highest.max(), self.peaks
+        n = k + int(np.sum((level < top - self.depth) & (level >= top - reach)))
         q = k / n
         if q <= p:
             return 0.0
@@ -208,6 +212,13 @@ def _quantum(x: np.ndarray) -> float:
     quantum = steps.min()
     ratio = steps[steps < 20 * quantum] / quantum
     return float(quantum) if np.mean(np.abs(ratio - np.round(ratio)) < 0.1) > 0.9 else 0.0
+
+
+def _peaks(x: np.ndarray) -> Float[np.ndarray, "2 P"]:
+    """Of each local maximum that may have been cut, its sample and how far above it a parabola may reach."""
+    i = 2 + np.flatnonzero((x[2:-2] >= x[1:-3]) & (x[2:-2] > x[3:-1]))
+    i = i[~_whole(x, i)]
+    return np.stack([x[i], (2 * x[i] - x[i - 1] - x[i + 1]) / 8])
 
 
 def _whole(x: np.ndarray, i: np.ndarray) -> np.ndarray:

@@ -1,6 +1,5 @@
 """The linear smoother by general libraries in JAX, and as in a textbook."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -126,8 +125,8 @@ def linear_model(trials: WalkingTrials) -> LinearModel:
 
 
 Variant = Literal["moments", "sequential", "parallel"]
-Smoother = Callable[[], tuple[Float[Array, "B N1 9"], Float[Array, "B N1 9 9"]]]
-"""Means and covariances of the N+1 states of each trial; compiled by its first call."""
+Smoother = partial[tuple[Float[Array, "B N1 9"], Float[Array, "B N1 9 9"]]]
+"""Means and covariances of the N+1 states of each trial; compiled by its first call. Its arguments lead with B."""
 
 
 def _observed(model: LinearModel) -> tuple[Array, Array]:
