@@ -29,6 +29,7 @@ from peers.paper_way import bar_problem, dense_objective, paper_way
 from peers.smoothers import cuthbert_smoother, dynamax_smoother, linear_model, walking_trials
 from problems import (
     OPTIONS,
+    SWEEP,
     Batch,
     bars,
     direct,
@@ -244,36 +245,9 @@ def growth() -> Iterator[Row]:
     )  # fmt: skip
 
 
-_SWEEP = """
-import dataclasses, resource, sys, time
-import jax, numpy as np
-from jaxsat import Sensor, load_config, simulate, sweep
-from jaxsat.studies.motions import Bar
-from jaxsat.studies import sweep as module
-trials, rails = int(sys.argv[1]), int(sys.argv[2])
-recording, truth = simulate(Bar(), rate=320.0, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
-rng = np.random.default_rng(0)
-recordings = [
-    dataclasses.replace(
-        recording, rest=truth.rest, name=f"bar {i}",
-        gyr=recording.gyr + 1e-3 * rng.normal(size=recording.gyr.shape),
-    )
-    for i in range(trials)
-]
-start = time.perf_counter()
-table = sweep(
-    recordings, load_config(None, **{"saturation.gyr_bound": 5.0}), methods=("direct",),
-    gyr_rails=np.linspace(4.0, 10.0, rails), memory=1.5e8,
-)
-seconds = time.perf_counter() - start
-assert len(table) == trials * rails
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, seconds, (table.status == "converged").mean())
-"""
-
-
 def sweep_peak(small: bool = False) -> Iterator[Row]:
     trials = 100 if small else 1000
-    command = [sys.executable, "-c", _SWEEP, str(trials), "16"]
+    command = [sys.executable, "-c", SWEEP, str(trials), "16"]
     peak, seconds, settled = map(
         float, subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     )

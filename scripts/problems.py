@@ -32,6 +32,34 @@ jax.config.update("jax_enable_x64", True)
 OPTIONS = search_options(load_config(), "direct")
 
 
+# A sweep in a process of its own; trials and rails are its arguments. Prints peak memory, seconds, share converged.
+SWEEP = """
+import dataclasses, resource, sys, time
+import jax, numpy as np
+from jaxsat import Sensor, load_config, simulate, sweep
+from jaxsat.studies.motions import Bar
+from jaxsat.studies import sweep as module
+trials, rails = int(sys.argv[1]), int(sys.argv[2])
+recording, truth = simulate(Bar(), rate=320.0, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
+rng = np.random.default_rng(0)
+recordings = [
+    dataclasses.replace(
+        recording, rest=truth.rest, name=f"bar {i}",
+        gyr=recording.gyr + 1e-3 * rng.normal(size=recording.gyr.shape),
+    )
+    for i in range(trials)
+]
+start = time.perf_counter()
+table = sweep(
+    recordings, load_config(None, **{"saturation.gyr_bound": 5.0}), methods=("direct",),
+    gyr_rails=np.linspace(4.0, 10.0, rails), memory=1.5e8,
+)
+seconds = time.perf_counter() - start
+assert len(table) == trials * rails
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, seconds, (table.status == "converged").mean())
+"""
+
+
 class Batch(eqx.Module):
     """Bar trials of the paper's simulation, each clipped so that as many samples saturate as asked."""
 
