@@ -38,7 +38,6 @@ import dataclasses, resource, sys, time
 import jax, numpy as np
 from jaxsat import Sensor, load_config, simulate, sweep
 from jaxsat.studies.motions import Bar
-from jaxsat.studies import sweep as module
 trials, rails = int(sys.argv[1]), int(sys.argv[2])
 recording, truth = simulate(Bar(), rate=320.0, duration=1.6, sensor=Sensor(), key=jax.random.key(0))
 rng = np.random.default_rng(0)
@@ -132,10 +131,10 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
 PART = 1024 if jax.default_backend() == "gpu" else 128
 
 
-def side_by_side(solve: Callable, arguments: Any, part: int = PART) -> Callable:
-    """solve(arguments) by parts of their leading axis, on all cores as a sweep uses them: what each gives."""
+def side_by_side(solve: Callable, arguments: Any, most: int = PART) -> Callable:
+    """solve(arguments) by parts of at most so many of their leading axis, on all cores as a sweep uses them."""
     leaves, structure = jax.tree.flatten(arguments)
-    parts = -(-len(leaves[0]) // part)
+    parts = -(-len(leaves[0]) // most)
     split = zip(*(np.array_split(leaf, parts) for leaf in leaves), strict=True)
     given = [jax.device_put(jax.tree.map(jnp.asarray, structure.unflatten(part))) for part in split]
     if parts == 1:

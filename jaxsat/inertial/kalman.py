@@ -94,6 +94,6 @@ def condition_on_future(
 
     columns: those of the covariance that belong to the adjoint's states; on the others nothing later depends.
     """
-    # Symmetric to rounding: nothing is computed from it here, and to mirror it would take as long again.
+    # Symmetric to rounding; nothing feeds on it, and to mirror it XLA would compute it twice.
     smoothed = covariance - product(product(columns, adjoint.curvature), columns.T)
     return mean - product(columns, adjoint.gradient[:, None])[:, 0], smoothed

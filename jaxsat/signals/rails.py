@@ -73,7 +73,7 @@ def find_rails(recording: Recording, gyr: RailSetting = "auto", acc: RailSetting
 
 def _sensor_rails(signal: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Plateau edges of the three axes of one sensor, downwards and upwards (2, 3)."""
-    found = np.array([find_rails_of(signal[usable[:, j], j]) for j in range(3)])
+    found = np.array([_channel_rails(signal[usable[:, j], j]) for j in range(3)])
     score, edge = found[..., 0].T, found[..., 1].T
     sure = (score >= EVIDENCE) & np.isfinite(edge)
     # The axes of a sensor share one full scale: beside a sure rail, being likelier than not is enough.
@@ -83,7 +83,7 @@ def _sensor_rails(signal: np.ndarray, usable: np.ndarray) -> np.ndarray:
     return np.where(sure, edge, np.inf)
 
 
-def find_rails_of(x: Float[np.ndarray, "N"]) -> list[tuple[float, float]]:
+def _channel_rails(x: Float[np.ndarray, "N"]) -> list[tuple[float, float]]:
     """Of one channel, downwards and upwards: log-odds that its peaks were cut off, and where their plateau begins."""
     if len(x) < 7 or x.max() == x.min():
         return [(-np.inf, np.inf)] * 2
