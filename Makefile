@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml
 	$(VENV)/bin/python -m pip install --quiet --editable ".[dev]"
 	touch $@
 
-# The speed board; a few minutes on a quiet machine, with the packages that it compares with.
+# The speed board; half an hour on a quiet machine, with the packages that it compares with.
 bench: $(STAMP)
 	$(VENV)/bin/python -m pip install --quiet --editable ".[bench]"
 	$(VENV)/bin/python scripts/bench.py
