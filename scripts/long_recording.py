@@ -9,7 +9,6 @@ import argparse
 import json
 import os
 import platform
-import resource
 import subprocess
 import sys
 import time
@@ -35,7 +34,8 @@ def run(method: str, minutes: float) -> dict:
     start = time.perf_counter()
     found = estimate(recording, settings)
     seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # `getrusage` would count the process that started this one.
+    peak = 1024 * int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
     saturated = int(found.saturated.sum())
     return {"samples": len(recording), "saturated": saturated, "seconds": seconds, "peak_bytes": peak}
 

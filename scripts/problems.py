@@ -34,7 +34,7 @@ OPTIONS = search_options(load_config(), "direct")
 
 # A sweep in a process of its own; trials and rails are its arguments. Prints peak memory, seconds, share converged.
 SWEEP = """
-import dataclasses, resource, sys, time
+import dataclasses, pathlib, sys, time
 import jax, numpy as np
 from jaxsat import Sensor, load_config, simulate, sweep
 from jaxsat.studies.motions import Bar
@@ -55,7 +55,8 @@ table = sweep(
 )
 seconds = time.perf_counter() - start
 assert len(table) == trials * rails
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, seconds, (table.status == "converged").mean())
+peak = pathlib.Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]
+print(int(peak) * 1024, seconds, (table.status == "converged").mean())
 """
 
 

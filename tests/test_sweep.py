@@ -136,7 +136,9 @@ def test_a_trial_that_cannot_be_used_costs_one_row(table, trials):
     assert table["note"].notna().sum() == 1
 
 
-def test_neither_memory_nor_devices_change_a_number(table, trials):
+@pytest.mark.parametrize("calls", [1, 2])
+def test_neither_memory_nor_devices_nor_cores_change_a_number(table, trials, calls):
+    """calls: at once, as on a CPU that is one device."""
     steps, places = [], []
     original = elements._scores
 
@@ -147,6 +149,7 @@ def test_neither_memory_nor_devices_change_a_number(table, trials):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(elements, "_scores", kept)
+        patch.setattr(sweep_module, "_calls_at_once", lambda: calls)
         chunked = sweep(
             trials, settings(), gyr_rails=RAILS, memory=chunk_of(1), progress=lambda *step: steps.append(step)
         )

@@ -109,19 +109,6 @@ def use_compilation_cache() -> None:
     keep_traces(Path(jax.config.jax_compilation_cache_dir) / "traces")  # type: ignore[attr-defined]
 
 
-def use_all_cores() -> None:
-    """A device of JAX for each core, for what is spread over devices; unless JAX was told how many."""
-    import jax
-
-    from jaxsat.inertial.programs import usable_cores
-
-    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if not told and jax.config.jax_num_cpu_devices < 1:  # type: ignore[attr-defined]
-        # Too late where the process has used JAX before: then it is one.
-        with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", usable_cores())
-
-
 def tell(text: str, warnings: list[str], quiet: bool, strict: bool) -> None:
     """The last words of a command that worked: its text, its warnings, and exit code 3 if these count."""
     if not quiet:

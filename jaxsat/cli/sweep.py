@@ -22,7 +22,6 @@ from jaxsat.cli.shared import (
     progress_bar,
     read_recording,
     scales,
-    use_all_cores,
     use_compilation_cache,
 )
 from jaxsat.errors import InputError
@@ -81,7 +80,6 @@ def sweep_command(
         "acc_bounds": acc_bound or [settings.saturation.acc_bound],
     }
     use_compilation_cache()
-    use_all_cores()
     from jaxsat.studies.sweep import sweep
 
     def loader(path: Path):

@@ -188,8 +188,9 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
         # The prior tells apart what the data do not, so full steps may be tried at once, and nothing need be damped:
         # smooth movement has directions of very little curvature.
         first = least = jnp.minimum(least, _UNDAMPED)
-    linearise = jax.jit(linearise)  # so that it is traced once
-    rank = len(jax.eval_shape(linearise, box.start)[2])
+    # Traced once; a method of a module of tracers, which has no hash, would not do for `jit`.
+    once = jax.jit(lambda x: linearise(x))
+    rank = len(jax.eval_shape(once, box.start)[2])
 
     def proceed(carry):
         _, _, (_, _, _, error), _, damping, count = carry
@@ -199,7 +200,7 @@ def projected_gauss_newton(linearise: Linearise, box: Box) -> Solution:
         # The start is evaluated in the first round, so the objective is compiled once.
         u, there, at, promised, damping, count = carry
         value, _, _, error = at
-        new = _assess(linearise, there, box.scale, low, high)
+        new = _assess(once, there, box.scale, low, high)
         kept = jnp.where(promised > 0.0, (value - new[0]) / jnp.where(promised > 0.0, promised, 1.0), 0.0)
         # Where the value no longer tells two points apart, the residual does.
         level = (new[0] - value <= 1e-13 * jnp.abs(value)) & (new[3] < error)

@@ -1,9 +1,9 @@
 """The elements of a sweep: one trial clipped at one set of rails, reconstructed by every method, and compared.
 
-`score` works on one element; `run_elements` is the one place where `vmap` runs over many of them.
+`score` works on one element; `run_elements` is the one place that runs it on many of them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -42,6 +42,9 @@ _PER_SAMPLE, _PER_METHOD, _PER_MOVING, _PER_VALUE = 450, 200, 75, 110
 # And of `map`, for each sample and each pair of such values.
 _PER_LEARNED, _PER_PAIR = 1000, 10
 
+# Elements of a call on each device of a CPU, which runs them one after the other: more would only wait for the last.
+ELEMENTS = 64
+
 # How a search can end, from best to worst.
 _SEVERITY = (
     Status.NOTHING_TO_DO,
@@ -51,7 +54,7 @@ _SEVERITY = (
     Status.MAX_ITERATIONS,
 )
 
-Scores = dict[str, dict[str, Array]]
+Scores = dict[str, dict[str, Arrays]]
 """Of each method, by the names of columns."""
 
 
@@ -148,7 +151,7 @@ def run_elements(
     options: tuple[Options, ...],
     config: Config,
     standard: bool,
-) -> dict[str, dict[str, np.ndarray]]:
+) -> Scores:
     """The scores of some elements, by method.
 
     cases: all of like shapes. The number of elements is a multiple of that of the local devices, among which they are
@@ -206,12 +209,19 @@ def _paths_of_device(trials: Trial, wanted, relinearisations) -> Float[Array, "C
         calibration = _calibration(trial, trial.signal, trial.unfilled_variance, wanted)
         return _smooth_path(trial, trial.signal, trial.variance, calibration, relinearisations)
 
-    return jax.vmap(path)(trials)
+    return _of_each(path, trials)
 
 
 @partial(stored_jit, options=None)
 def _scores_of_device(cases: Case, rails, bounds, *settings) -> Scores:
-    return jax.vmap(lambda case, rail, bound: score(case, rail, bound, *settings))(cases, rails, bounds)
+    return _of_each(lambda case, rail, bound: score(case, rail, bound, *settings), cases, rails, bounds)
+
+
+def _of_each(function: Callable, *over):
+    """`vmap`; on a CPU a loop: filters of one trial are one program there, and what they keep fits its caches."""
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda each: function(*each), over)
+    return jax.vmap(function)(*over)
 
 
 def score(

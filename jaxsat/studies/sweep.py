@@ -1,8 +1,8 @@
 """Many trials at many rails in few calls: each trial is clipped in software, filled again, and compared.
 
 One element is a trial at one gyroscope rail, one accelerometer rail and one pair of bounds; all methods are run on
-it. Elements of trials of about the same length share a compiled program, and `vmap` runs over them in chunks that
-keep to a memory budget, spread over the local devices. A trial that cannot be used costs one row of the table.
+it. Elements of trials of about the same length share a compiled program, which runs on them in chunks that keep to a
+memory budget, spread over the local devices or cores. A trial that cannot be used costs one row of the table.
 """
 
 import itertools
@@ -17,13 +17,25 @@ from jaxtyping import Float, Int
 
 from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
-from jaxsat.inertial.programs import computing, make_room, on_processor
+from jaxsat.inertial.programs import Beside, computing, make_room, on_processor, usable_cores
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
+from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording
-from jaxsat.studies.elements import Case, chunks, element_bytes, make_case, measured, offset_of, run_elements
+from jaxsat.studies.elements import (
+    ELEMENTS,
+    Case,
+    Chunk,
+    Scores,
+    chunks,
+    element_bytes,
+    make_case,
+    measured,
+    offset_of,
+    run_elements,
+)
 
 Progress = Callable[[str, int, int], None]
 """Called with ("sweep", elements done, elements in all)."""
@@ -80,10 +92,7 @@ def sweep(
         total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
         for batch in batches:
             make_room()
-            for chunk in chunks(len(batch.cases), plan.grid, _chunk_size(batch, plan)):
-                scores = run_elements(
-                    batch.cases, chunk, batch.sizes, options, plan.config, "standard" in plan.methods
-                )
+            for chunk, scores in _run(batch, plan, options):
                 names = [batch.names[i] for i in chunk.which[: chunk.real]]
                 rows += _rows(scores, names, chunk.values, plan.methods)
                 done += chunk.real
@@ -213,17 +222,37 @@ def _clipped_most(prepared: Prepared, lowest: Float[np.ndarray, "6"], name: str)
     return np.where(clipped, 1, np.asarray(prepared.trial.sign))
 
 
+def _calls_at_once() -> int:
+    """A CPU that is one device runs as many as it has cores; otherwise devices share the elements of one."""
+    alone = jax.default_backend() == "cpu" and jax.local_device_count() == 1
+    return usable_cores() if alone else 1
+
+
 def _chunk_size(batch: _Batch, plan: _Plan) -> int:
-    """How many elements run at once: as many on every local device, and no more than the memory holds."""
-    case, devices = batch.cases[0], jax.local_device_count()
+    """How many elements are in a call: as many on every local device, and no more than the memory holds."""
+    case, devices, calls = batch.cases[0], jax.local_device_count(), _calls_at_once()
     each = element_bytes(len(case.trial.signal), len(case.departure), batch.sizes, plan.methods)
-    memory = plan.memory / (devices if jax.default_backend() == "cpu" else 1)
-    count = len(batch.cases) * len(plan.grid)
-    return devices * int(max(1.0, min(memory / each, -(-count // devices))))
+    most, memory = -(-len(batch.cases) * len(plan.grid) // (devices * calls)), plan.memory
+    if jax.default_backend() == "cpu":
+        most, memory = min(most, ELEMENTS), memory / (devices * calls)
+    return devices * int(max(1.0, min(memory / each, most)))
+
+
+def _run(batch: _Batch, plan: _Plan, options: tuple[Options, ...]) -> Iterator[tuple[Chunk, Scores]]:
+    """The elements of a batch, chunk after chunk."""
+    first, *others = chunks(len(batch.cases), plan.grid, _chunk_size(batch, plan))
+
+    def run(chunk: Chunk) -> Scores:
+        return run_elements(batch.cases, chunk, batch.sizes, options, plan.config, "standard" in plan.methods)
+
+    # The first compiles what the others run.
+    yield first, run(first)
+    with Beside(_calls_at_once()) as beside:
+        yield from zip(others, beside.map(run, others), strict=True)
 
 
 def _rows(
-    scores: dict[str, dict[str, np.ndarray]],
+    scores: Scores,
     names: list[str],
     values: Float[np.ndarray, "C 4"],
     methods: tuple[str, ...],
