@@ -162,6 +162,18 @@ def test_neither_memory_nor_devices_nor_cores_change_a_number(table, trials, cal
     pd.testing.assert_frame_equal(chunked, expected, rtol=1e-9, atol=1e-9)
 
 
+def test_elements_side_by_side_as_on_a_gpu_are_those_one_after_the_other(table, trials):
+    original = elements._scores.__wrapped__
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(elements, "_of_each", lambda function, *over: jax.vmap(function)(*over))
+        # A function of its own, so that it is traced anew.
+        patch.setattr(elements, "_scores", eqx.filter_jit(wraps(original)(lambda *args: original(*args))))
+        found = sweep(trials, settings(), gyr_rails=RAILS, memory=chunk_of(6 // DEVICES))
+    np.testing.assert_allclose(found["fill_rmse_gyr"], table["fill_rmse_gyr"], atol=1e-8)
+    found, expected = (t.drop(columns="fill_rmse_gyr") for t in (found, table))
+    pd.testing.assert_frame_equal(found, expected, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("rails", "memory"), [pytest.param(1, 2e9, marks=pytest.mark.slow), (32, chunk_of(6 // DEVICES))]
 )

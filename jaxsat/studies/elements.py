@@ -36,8 +36,8 @@ from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import sensor_changes
 
 # Numbers of eight bytes that a call keeps alive for each sample (and for each further method that compensates), each
-# padded sample of a segment, and each of its padded saturated values; fitted to what XLA reports on a CPU for its
-# arguments, results and temporary arrays.
+# padded sample of a segment, and each of its padded saturated values; fitted to what XLA reported on a CPU, elements
+# side by side, for its arguments, results and temporary arrays.
 _PER_SAMPLE, _PER_METHOD, _PER_MOVING, _PER_VALUE = 450, 200, 75, 110
 # And of `map`, for each sample and each pair of such values.
 _PER_LEARNED, _PER_PAIR = 1000, 10
