@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import jax
-from paper import page, searches, simulations, walks
+from paper import drawn, page, searches, simulations, walks
 from paper.trials import ROOT, Settings, settings
 
 from jaxsat.cli.shared import use_compilation_cache
@@ -35,6 +35,7 @@ EXPERIMENTS = {
     "walk_clipped": walks.software,
     "segments": walks.orders,
     "coverage": searches.coverage,
+    "coverage_drawn": partial(searches.coverage, trial=drawn.drawn),
     "iterations": searches.iterations,
     "starts": searches.starts,
     "eq21": searches.eq21,

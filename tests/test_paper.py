@@ -9,9 +9,14 @@ import json
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+
+from jaxsat.inertial.strapdown import NavState, strapdown
+from jaxsat.studies.simulate import GRAVITY
 
 ROOT = Path(__file__).resolve().parents[1]
 METHODS = ("direct", "triangle", "quadratic", "map")
@@ -127,10 +132,27 @@ def test_section_5_both_orders_agree_on_one_segment(run):
 
 
 @pytest.mark.slow
-def test_intervals_are_counted(run):
-    table = run("coverage")
+@pytest.mark.parametrize("name", ["coverage", "coverage_drawn"])
+def test_intervals_are_counted(run, name):
+    table = run(name)
     shares = table[[f"{what}_{share}" for what in ("fill", "peak", "end") for share in (50, 90)]].to_numpy()
     assert shares.min() >= 0.0 and shares.max() <= 1.0 and table["sd_median"].min() > 0.0
+
+
+@pytest.mark.slow
+def test_a_drawn_recording_is_that_of_a_sensor(script):
+    """Of which the strapdown ends at rest, and which only lacks what lies beyond the rail."""
+    recording, truth, _ = script.drawn.drawn(script.settings("coverage_drawn"), 0)
+    period = np.full(len(recording), np.median(np.diff(recording.time)))
+    with jax.enable_x64(True):
+        start = NavState(*(jnp.asarray(x[0]) for x in (truth.q_nb, truth.velocity, truth.position)))
+        states = strapdown(jnp.asarray(truth.signal), jnp.asarray(period), start, jnp.asarray(GRAVITY))
+    velocity = np.asarray(states.velocity)
+    assert np.abs(velocity[-1]).max() < 1e-9 < 0.1 < np.abs(velocity).max()
+    np.testing.assert_allclose(states.position[:-1], truth.position, atol=1e-12)
+    hidden = truth.saturated
+    np.testing.assert_array_equal(recording.signal[~hidden], truth.noisy[~hidden])
+    assert hidden.any() and (np.abs(truth.noisy[hidden]) >= np.abs(recording.signal[hidden])).all()
 
 
 @pytest.mark.slow

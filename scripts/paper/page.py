@@ -73,13 +73,13 @@ def board(out: Path, done: Mapping[str, Settings]) -> Iterator[Row]:
                 None,
                 note,
             )
-    if "coverage" in done:
-        for row in _read(out, "coverage").to_dict("records"):
+    for name in ("coverage", "coverage_drawn"):
+        for row in _read(out, name).to_dict("records") if name in done else ():
             for column, what in _INTERVALS.items():
                 for share in (50, 90):
                     value = row[f"{column}_{share}"]
                     note = f"{value:.0%} of {what} lie in their {share} % interval, {row['seeds']} seeds"
-                    metric = f"coverage_{column}_{share}_{row['method']}"
+                    metric = f"{name}_{column}_{share}_{row['method']}"
                     yield Row(metric, abs(value - share / 100.0), "1", "lower", 0.05, None, note)
     took = [json.loads((out / name / "env.json").read_text()) for name in done]
     cpu = sum(each.get("cpu_seconds", np.nan) for each in took) / 60.0

@@ -1,5 +1,6 @@
 """Beyond the paper: the search of one segment seen from inside, coverage of the intervals, and Eq. 21 as printed."""
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -31,18 +32,19 @@ from .trials import QUANTILES, Settings, clipped, config_of, record
 
 SIZES = Sizes(256, 64)
 SHARES = (0.5, 0.9)
+Trials = Callable[[Settings, int], tuple[Recording, Truth, Config]]
 SOLVERS = {"gauss_newton": projected_gauss_newton, "projected_gradient": projected_gradient}
 
 
-def coverage(chosen: Settings, out: Path) -> None:
+def coverage(chosen: Settings, out: Path, trial: Trials = clipped) -> None:
     """How often intervals hold the truth: filled values, peaks, and the three coordinates of the end.
 
-    From `estimate`, recording by recording: a sweep gives no covariances.
+    trial: makes the recording of a seed. From `estimate`, recording by recording: a sweep gives no covariances.
     """
     rows, ends = [], {method: [] for method in chosen["methods"]}
     for method in chosen["methods"]:
         for seed in range(chosen["seeds"]):
-            recording, truth, config = clipped(chosen, seed)
+            recording, truth, config = trial(chosen, seed)
             found = estimate(recording, config.model_copy(update={"method": method}))
             lost = found.saturated
             # The signal without noise is what is asked for; the sd of a filled value holds the noise too.
