@@ -23,7 +23,7 @@ from jaxsat.saturation.methods import Options
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import find_segments
 from jaxsat.studies import sweep
-from jaxsat.studies.elements import chunks, run_elements
+from jaxsat.studies.elements import run_elements
 from jaxsat.studies.motions import Bar, Walk
 from jaxsat.studies.simulate import GRAVITY, Truth
 
@@ -177,10 +177,8 @@ def swept(trials: int, rails: int, memory: float) -> Callable:
 
     def run():
         with computing():
-            return [
-                run_elements(batch.cases, chunk, batch.sizes, (OPTIONS,), config, False)
-                for chunk in chunks(trials, plan.grid, sweep._chunk_size(batch, plan))
-            ]
+            given = (sweep._chunk_size(batch, plan), batch.sizes, (OPTIONS,), config, False)
+            return [scores for _, scores in run_elements(batch.cases, plan.grid, *given)]
 
     return run
 

@@ -149,7 +149,7 @@ def test_neither_memory_nor_devices_nor_cores_change_a_number(table, trials, cal
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(elements, "_scores", kept)
-        patch.setattr(sweep_module, "_calls_at_once", lambda: calls)
+        patch.setattr(elements, "calls_at_once", lambda: calls)
         chunked = sweep(
             trials, settings(), gyr_rails=RAILS, memory=chunk_of(1), progress=lambda *step: steps.append(step)
         )

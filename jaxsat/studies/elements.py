@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
 from jaxsat.inertial.calibration import Calibration
-from jaxsat.inertial.programs import compiled, stored_jit
+from jaxsat.inertial.programs import Beside, compiled, stored_jit, usable_cores
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import constants_sd
@@ -144,7 +144,38 @@ def chunks(cases: int, grid: Float[np.ndarray, "E 4"], size: int) -> Iterator[Ch
         yield Chunk(at // len(grid), grid[at % len(grid)], held, min(size, count - first))
 
 
+def calls_at_once() -> int:
+    """A CPU that is one device runs as many as it has cores; otherwise devices share the elements of one."""
+    alone = jax.default_backend() == "cpu" and jax.local_device_count() == 1
+    return usable_cores() if alone else 1
+
+
 def run_elements(
+    cases: Sequence[Case],
+    grid: Float[np.ndarray, "E 4"],
+    size: int,
+    sizes: Sizes,
+    options: tuple[Options, ...],
+    config: Config,
+    standard: bool,
+) -> Iterator[tuple[Chunk, Scores]]:
+    """The scores, by method, of every case at each row of rails and bounds, chunk after chunk.
+
+    cases: all of like shapes. size: elements of a chunk, a multiple of the number of local devices, among which they
+    are spread. Chunks of one size that hold as many cases share a program.
+    """
+    first, *others = chunks(len(cases), grid, size)
+
+    def run(chunk: Chunk) -> Scores:
+        return _run_chunk(cases, chunk, sizes, options, config, standard)
+
+    # The first compiles what the others run.
+    yield first, run(first)
+    with Beside(calls_at_once()) as beside:
+        yield from zip(others, beside.map(run, others), strict=True)
+
+
+def _run_chunk(
     cases: Sequence[Case],
     chunk: Chunk,
     sizes: Sizes,
@@ -152,11 +183,6 @@ def run_elements(
     config: Config,
     standard: bool,
 ) -> Scores:
-    """The scores of some elements, by method.
-
-    cases: all of like shapes. The number of elements is a multiple of that of the local devices, among which they are
-    spread; chunks of one size that hold as many cases share a program.
-    """
     devices = jax.local_device_count()
     mesh = jax.make_mesh((devices,), ("elements",), (AxisType.Auto,), devices=jax.local_devices())
     rails, bounds = (np.repeat(part, 3, axis=1) for part in np.split(chunk.values, 2, axis=1))

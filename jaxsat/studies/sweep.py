@@ -17,19 +17,17 @@ from jaxtyping import Float, Int
 
 from jaxsat.config import Config, Method
 from jaxsat.errors import InputError
-from jaxsat.inertial.programs import Beside, computing, make_room, on_processor, usable_cores
+from jaxsat.inertial.programs import computing, make_room, on_processor
 from jaxsat.pipeline import search_options
 from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket, count_values, padded_sizes
-from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.elements import (
     ELEMENTS,
     Case,
-    Chunk,
     Scores,
-    chunks,
+    calls_at_once,
     element_bytes,
     make_case,
     measured,
@@ -92,7 +90,8 @@ def sweep(
         total, done = sum(len(batch.cases) for batch in batches) * len(plan.grid), 0
         for batch in batches:
             make_room()
-            for chunk, scores in _run(batch, plan, options):
+            given = (_chunk_size(batch, plan), batch.sizes, options, plan.config, "standard" in plan.methods)
+            for chunk, scores in run_elements(batch.cases, plan.grid, *given):
                 names = [batch.names[i] for i in chunk.which[: chunk.real]]
                 rows += _rows(scores, names, chunk.values, plan.methods)
                 done += chunk.real
@@ -222,33 +221,14 @@ def _clipped_most(prepared: Prepared, lowest: Float[np.ndarray, "6"], name: str)
     return np.where(clipped, 1, np.asarray(prepared.trial.sign))
 
 
-def _calls_at_once() -> int:
-    """A CPU that is one device runs as many as it has cores; otherwise devices share the elements of one."""
-    alone = jax.default_backend() == "cpu" and jax.local_device_count() == 1
-    return usable_cores() if alone else 1
-
-
 def _chunk_size(batch: _Batch, plan: _Plan) -> int:
     """How many elements are in a call: as many on every local device, and no more than the memory holds."""
-    case, devices, calls = batch.cases[0], jax.local_device_count(), _calls_at_once()
+    case, devices, calls = batch.cases[0], jax.local_device_count(), calls_at_once()
     each = element_bytes(len(case.trial.signal), len(case.departure), batch.sizes, plan.methods)
     most, memory = -(-len(batch.cases) * len(plan.grid) // (devices * calls)), plan.memory
     if jax.default_backend() == "cpu":
         most, memory = min(most, ELEMENTS), memory / (devices * calls)
     return devices * int(max(1.0, min(memory / each, most)))
-
-
-def _run(batch: _Batch, plan: _Plan, options: tuple[Options, ...]) -> Iterator[tuple[Chunk, Scores]]:
-    """The elements of a batch, chunk after chunk."""
-    first, *others = chunks(len(batch.cases), plan.grid, _chunk_size(batch, plan))
-
-    def run(chunk: Chunk) -> Scores:
-        return run_elements(batch.cases, chunk, batch.sizes, options, plan.config, "standard" in plan.methods)
-
-    # The first compiles what the others run.
-    yield first, run(first)
-    with Beside(_calls_at_once()) as beside:
-        yield from zip(others, beside.map(run, others), strict=True)
 
 
 def _rows(

@@ -18,7 +18,7 @@ from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.layout import Sizes, bucket
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import Recording
-from jaxsat.studies.elements import Case, chunks, make_case, run_elements
+from jaxsat.studies.elements import Case, make_case, run_elements
 from jaxsat.studies.motions import MOTIONS, Motion
 from jaxsat.studies.simulate import Sensor, Truth, simulate
 
@@ -134,8 +134,8 @@ def score(trials: Elements, values: Float[np.ndarray, "E 4"], chunk: int) -> pd.
     """
     options = tuple(search_options(trials.config, method) for method in METHODS)
     parts = []
-    for some in chunks(len(trials.cases), values, chunk):
-        found = run_elements(trials.cases, some, trials.sizes, options, trials.config, standard=True)
+    given = (trials.cases, values, chunk, trials.sizes, options, trials.config)
+    for some, found in run_elements(*given, standard=True):
         real = slice(0, some.real)
         for method, columns in found.items():
             part = pd.DataFrame({name: column[real] for name, column in columns.items()})
