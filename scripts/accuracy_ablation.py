@@ -102,6 +102,11 @@ def refilled(found: Estimate, true: Signal, rest) -> dict[str, tuple[Signal, np.
     """Signals and rests to make a path of; rest: of the unclipped recording."""
     filled = found.filled
 
+    def sum_and_centroid(inside: slice, channel: int) -> np.ndarray:
+        """The fill of a gap, with the part of its error that is a line taken off."""
+        away, place = true[inside, channel] - filled[inside, channel], np.arange(inside.stop - inside.start)
+        return filled[inside, channel] + np.polyval(np.polyfit(place, away, min(1, len(place) - 1)), place)
+
     def short(inside: slice, channel: int) -> float:
         """By how much the fill of a gap falls short of the truth, on average."""
         return float(np.mean(true[inside, channel] - filled[inside, channel]))
@@ -110,6 +115,7 @@ def refilled(found: Estimate, true: Signal, rest) -> dict[str, tuple[Signal, np.
         "nothing filled": found.recording.signal,
         "as filled": filled,
         "sums of gaps true": of_gaps(found, lambda inside, c: filled[inside, c] + short(inside, c)),
+        "sums and centroids of gaps true": of_gaps(found, sum_and_centroid),
         "shapes of gaps true": of_gaps(found, lambda inside, c: true[inside, c] - short(inside, c)),
         "turns about the vertical true": turned(found, true, vertical=True),
         "turns about the horizontal true": turned(found, true, vertical=False),
