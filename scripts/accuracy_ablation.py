@@ -204,6 +204,7 @@ def main() -> int:
         before = pd.read_csv(path)
         kept = before.loc[~before["part"].isin(arguments.only)].to_dict("records")
         table = pd.DataFrame([*kept, *table.to_dict("records")])
+    table = table.sort_values("part", kind="stable")
     arguments.output.mkdir(parents=True, exist_ok=True)
     table.to_csv(path, index=False, float_format="%.4g")
     (arguments.output / "ablation.md").write_text("\n\n".join(page(table)) + "\n")
