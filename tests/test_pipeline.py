@@ -19,7 +19,6 @@ from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table
 from jaxsat.saturation import compensate
 from jaxsat.saturation.compensate import ENTRIES, LANES, signal_prior, solved_together
-from jaxsat.saturation.solvers import Status
 from jaxsat.signals.readers import read
 from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
 from jaxsat.studies.motions import Bar, Walk
@@ -162,27 +161,6 @@ def test_strides_without_a_rest_between_them_learn_from_the_others(shared_data):
         for sweeps in (1, "auto")
     ]
     assert away[1] < 0.5 * away[0]
-
-
-@pytest.mark.slow
-def test_both_solvers_end_at_the_same_cost_on_a_recording_that_truly_saturated(shared_data):
-    """Twelve segments side by side, of very unlike curvatures."""
-    path = shared_data / "pyshoe" / "2017-11-22-11-35-59.mat"
-    if not path.is_file():
-        pytest.skip(f"the trial is not at {path}")
-    recording = read(path, rest_column="zv_shoe_opt")
-    settings = {"method": "direct", "saturation.sweeps": 1, "saturation.tolerance": 1e-6}
-    newton, gradient = (
-        estimate(
-            recording,
-            load_config(None, **settings, **{"saturation.solver": solver, "saturation.max_iterations": most}),
-        ).fills
-        for solver, most in (("gauss_newton", 100), ("projected_gradient", 20_000))
-    )
-    busy = newton.status != Status.NOTHING_TO_DO
-    assert busy.sum() == 12
-    assert (newton.status[busy] == Status.CONVERGED).all() and (gradient.status == newton.status).all()
-    np.testing.assert_allclose(gradient.cost_after, newton.cost_after, rtol=1e-6)
 
 
 @pytest.mark.slow

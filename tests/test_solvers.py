@@ -1,4 +1,4 @@
-"""Both solvers on bounded problems with a known answer."""
+"""Both solvers on bounded problems with a known answer, and on a real recording with each other."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from jaxsat.config import load_config
+from jaxsat.pipeline import estimate
 from jaxsat.saturation.solvers import (
     Box,
     Status,
@@ -14,6 +16,7 @@ from jaxsat.saturation.solvers import (
     projected_gauss_newton,
     projected_gradient,
 )
+from jaxsat.signals.readers import read
 
 RNG = np.random.default_rng(4)
 A = RNG.normal(size=(6, 8)) * np.geomspace(1.0, 30.0, 8)
@@ -152,3 +155,24 @@ def test_dense_box_step_is_the_solution_of_the_bounded_quadratic_problem(seed, w
     tolerance = 1e-6 * np.abs(gradient).max()
     assert (np.abs(slope[inside]) < tolerance).all()
     assert (slope[(d == low) & free] > -tolerance).all() and (slope[(d == high) & free] < tolerance).all()
+
+
+@pytest.mark.slow
+def test_both_solvers_end_at_the_same_cost_on_a_recording_that_truly_saturated(shared_data):
+    """Twelve segments side by side, of very unlike curvatures."""
+    path = shared_data / "pyshoe" / "2017-11-22-11-35-59.mat"
+    if not path.is_file():
+        pytest.skip(f"the trial is not at {path}")
+    recording = read(path, rest_column="zv_shoe_opt")
+    settings = {"method": "direct", "saturation.sweeps": 1, "saturation.tolerance": 1e-6}
+    newton, gradient = (
+        estimate(
+            recording,
+            load_config(None, **settings, **{"saturation.solver": solver, "saturation.max_iterations": most}),
+        ).fills
+        for solver, most in (("gauss_newton", 100), ("projected_gradient", 20_000))
+    )
+    busy = newton.status != Status.NOTHING_TO_DO
+    assert busy.sum() == 12
+    assert (newton.status[busy] == Status.CONVERGED).all() and (gradient.status == newton.status).all()
+    np.testing.assert_allclose(gradient.cost_after, newton.cost_after, rtol=1e-6)
