@@ -133,7 +133,7 @@ PART = 1024 if jax.default_backend() == "gpu" else 128
 
 
 def side_by_side(solve: Callable, arguments: Any, most: int = PART) -> Callable:
-    """solve(arguments) by parts of at most so many of their leading axis, on all cores as a sweep uses them."""
+    """solve(arguments) by parts of at most so many of their leading axis, on all cores."""
     leaves, structure = jax.tree.flatten(arguments)
     parts = -(-len(leaves[0]) // most)
     split = zip(*(np.array_split(leaf, parts) for leaf in leaves), strict=True)

@@ -1,7 +1,7 @@
 """Float64, strict promotion, a persistent compilation cache, and the folder of real recordings."""
 
 import os
-from importlib import import_module
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,8 +17,9 @@ os.environ.setdefault(
 import jax
 import pytest
 
-# What this tells XLA counts only if it comes before the first program.
-import_module("jaxsat")
+# What the package tells XLA counts only if it comes before the first program.
+from jaxsat.signals.readers import read
+from jaxsat.signals.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 jax.config.update("jax_enable_x64", True)
@@ -42,3 +43,16 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real recordings are not at {folder}")
     return folder
+
+
+@pytest.fixture
+def pyshoe_trial(shared_data) -> Callable[[str], Recording]:
+    """Reads a PyShoe recording with the rests that it names."""
+
+    def load(name: str) -> Recording:
+        path = shared_data / "pyshoe" / f"{name}.mat"
+        if not path.is_file():
+            pytest.skip(f"the trial is not at {path}")
+        return read(path, rest_column="zv_shoe_opt")
+
+    return load

@@ -165,8 +165,8 @@ def test_the_search_descends(run):
 @pytest.mark.slow
 def test_with_a_prior_every_start_ends_alike(run):
     table = run("starts")
-    # Half a χ² but for a constant, so a share of it says nothing.
-    assert np.ptp(table["cost"]) < 1e-2 and table["away"].max() < 1e-2
+    # But for a constant, so it may be negative.
+    assert np.ptp(table["cost"]) < 1e-3 * abs(table["cost"].iloc[0]) and table["away"].max() < 1e-2
 
 
 def test_equation_21_as_printed_puts_peaks_outside_their_gaps(run):

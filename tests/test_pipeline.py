@@ -147,12 +147,9 @@ def rms(found: Estimate, true: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_strides_without_a_rest_between_them_learn_from_the_others(shared_data):
+def test_strides_without_a_rest_between_them_learn_from_the_others(pyshoe_trial):
     """A PyShoe walk clipped in software, two strides of which trade what they lost."""
-    path = shared_data / "pyshoe" / "2017-11-22-11-48-35.mat"
-    if not path.is_file():
-        pytest.skip(f"the trial is not at {path}")
-    whole = read(path, rest_column="zv_shoe_opt")
+    whole = pyshoe_trial("2017-11-22-11-48-35")
     rail = np.repeat([np.deg2rad(250.0), np.inf], 3)
     clipped = whole.with_signal(np.clip(whole.signal, -rail, rail))
     true = estimate(whole, load_config(None, method="standard")).trajectory.position

@@ -16,7 +16,6 @@ from jaxsat.saturation.solvers import (
     projected_gauss_newton,
     projected_gradient,
 )
-from jaxsat.signals.readers import read
 
 RNG = np.random.default_rng(4)
 A = RNG.normal(size=(6, 8)) * np.geomspace(1.0, 30.0, 8)
@@ -158,12 +157,9 @@ def test_dense_box_step_is_the_solution_of_the_bounded_quadratic_problem(seed, w
 
 
 @pytest.mark.slow
-def test_both_solvers_end_at_the_same_cost_on_a_recording_that_truly_saturated(shared_data):
+def test_both_solvers_end_at_the_same_cost_on_a_recording_that_truly_saturated(pyshoe_trial):
     """Twelve segments side by side, of very unlike curvatures."""
-    path = shared_data / "pyshoe" / "2017-11-22-11-35-59.mat"
-    if not path.is_file():
-        pytest.skip(f"the trial is not at {path}")
-    recording = read(path, rest_column="zv_shoe_opt")
+    recording = pyshoe_trial("2017-11-22-11-35-59")
     settings = {"method": "direct", "saturation.sweeps": 1, "saturation.tolerance": 1e-6}
     newton, gradient = (
         estimate(
