@@ -115,8 +115,12 @@ class Saturation(_Section):
 class Height(_Section):
     """What is known of the height of rests, relative to the first one."""
 
-    mode: Literal["off", "zero", "nonnegative"] = "off"
-    sd: float = Field(default=0.01, gt=0, description="sd of the height of a rest in mode `zero` (m)")
+    mode: Literal["auto", "off", "zero", "nonnegative"] = Field(
+        default="auto",
+        description="rests at one height: assumed where the recording agrees (auto), never (off) or always (zero); "
+        "or none below the first (nonnegative)",
+    )
+    sd: float = Field(default=0.01, gt=0, description="sd of the height of a rest on level ground (m)")
 
 
 class Smoother(_Section):

@@ -24,11 +24,9 @@ from jaxsat.inertial.smoother import (
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.preparation import prepare, without_floor
+from jaxsat.preparation import calibrate_by_rests, constants_sd, find_ground, prepare
 from jaxsat.saturation.compensate import (
-    FIRST_STEPS,
     Fills,
-    calibrate_recording,
     compensate_parallel,
     compensate_sequential,
     learn_prior,
@@ -81,6 +79,8 @@ class Estimate(eqx.Module):
     cost_standard: Float[np.ndarray, ""]
     """J* of the whole recording with saturation ignored."""
     gravity: float
+    level: bool
+    """The ground was found to be level: rests are at one height."""
     gyr_offset: Float[np.ndarray, "3"]
     floor: ActiveSet | None
     """Active set of `height.mode = "nonnegative"`."""
@@ -128,40 +128,26 @@ def prior_scales(config: Config) -> Scales:
     return Scales(jnp.asarray(chosen.prior_width, float), jnp.asarray(chosen.prior_share, float))
 
 
-def constants_sd(config: Config) -> Float[Array, "9"] | None:
-    """None where no constant is wanted."""
-    sd = config.smoother.constants_sd
-    return jnp.asarray(sd) if any(sd) else None
-
-
-def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
-    """The constants that the rests of a recording tell; what saturates may be anything within its bounds."""
-    sd, found = constants_sd(config), Calibration.none()
-    for _ in range(FIRST_STEPS if sd is not None else 0):
-        found = calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, found)
-    return found
-
-
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
     clock = _Clock()
     prepared = prepare(recording, config)
     trial, segments, gaps = prepared.trial, prepared.segments, prepared.gaps
     clock.lap("signals")
     fills = Fills.nothing(trial, len(segments))
-    searched = without_floor(trial, config)
     together = config.saturation.segments == "parallel"
     options = None
     if config.method != "standard" and len(gaps):
         options = search_options(config, config.method)
     # What the search does not wait for goes on beside it.
     with Beside(2) as beside:
-        programs = trace_search(searched, segments, options, together=together) if options else []
+        programs = trace_search(trial, segments, options, together=together) if options else []
         compiling = [beside.submit(program) for program in programs]
-        learning = beside.submit(learn_prior, searched, options) if options else None
-        calibration = calibrate_by_rests(searched, config)
+        learning = beside.submit(learn_prior, trial, options) if options else None
+        calibration = calibrate_by_rests(trial, config)
         clock.lap("calibration")
         sure = trial.calibrated(calibration)
-        ignoring = beside.submit(_smooth, sure, config)
+        ground = beside.submit(find_ground, prepared, config, calibration)
+        ignoring = beside.submit(lambda trial: _smooth(trial.on_ground(ground.result()), config), sure)
         compensated = None
         if options is not None and learning is not None:
 
@@ -171,7 +157,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 return prior.result()
 
             report = partial(progress, "segments")
-            given = searched, segments, options, calibration, learned
+            given = trial, segments, options, calibration, learned
             if together:
                 passes = config.saturation.passes(config.method)
                 fills, calibration = compensate_parallel(*given, passes, report)
@@ -183,10 +169,10 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
                 for extra in (fills.slack, fills.variance)
             )
-            compensated = _smooth(path, config)
+            compensated = _smooth(path.on_ground(ground.result()), config)
             # How sure the path is, is another question.
             if (fills.slack != fills.variance).any():
-                covariance = _covariance_of(*compensated, sure)
+                covariance = _covariance_of(*compensated, sure.on_ground(ground.result()))
                 compensated = eqx.tree_at(lambda s: s[0].covariance, compensated, covariance)
         standard, floor = ignoring.result()
         smoothed, floor = compensated or (standard, floor)
@@ -228,6 +214,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         cost=np.asarray(smoothed.cost),
         cost_standard=np.asarray(standard.cost),
         gravity=float(trial.gravity),
+        level=config.height.mode == "auto" and ground.result() is not None,
         gyr_offset=prepared.gyr_offset,
         floor=floor,
         warnings=prepared.warnings,
@@ -238,7 +225,8 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
 def displacements(found: Estimate) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3 3"]]:
     """The way from departure to arrival of each segment (m), and its covariance (m²).
 
-    NaN where no rest precedes or follows, the covariance also where heights are used, which tie ways together.
+    NaN where no rest precedes or follows, the covariance also with `height.mode = "zero"`, which ties ways together;
+    it does not count what is known of the ground otherwise.
     """
     segments, n = found.segments, len(found.recording)
     whole = (segments.departure >= 0) & (segments.arrival < n)
@@ -246,7 +234,7 @@ def displacements(found: Estimate) -> tuple[Float[np.ndarray, "S 3"], Float[np.n
     ends = np.stack([segments.departure, segments.arrival])[:, whole]
     position = found.trajectory.position
     way[whole] = position[ends[1]] - position[ends[0]]
-    if whole.any() and found.config.height.mode == "off":
+    if whole.any() and found.problem.rows.height is None:
         problem, size = found.problem, len(found.problem.period)
         # Padding repeats the last motion.
         count = int(whole.sum())

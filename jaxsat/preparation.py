@@ -8,14 +8,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.config import Config
 from jaxsat.errors import InputError
+from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.orientation import Gains, Start, backward
 from jaxsat.inertial.programs import computing, make_room, stored_jit
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
-from jaxsat.saturation.compensate import filter_recording
+from jaxsat.saturation.compensate import FIRST_STEPS, calibrate_recording, filter_recording
 from jaxsat.saturation.false_rests import false_rests
-from jaxsat.saturation.layout import Trial
+from jaxsat.saturation.layout import Trial, pad
+from jaxsat.saturation.level_ground import is_level
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording, sensor_changes
@@ -37,6 +39,8 @@ class Prepared(eqx.Module):
 
     trial: Trial
     """Padded."""
+    grounded: Bool[np.ndarray, "P"] | None
+    """First samples of rests that may be on the ground, padded; None where the ground is not asked for."""
     gyr_offset: Float[np.ndarray, "3"]
     """What was taken off the rates (rad/s)."""
     rails: Rails
@@ -69,11 +73,11 @@ def _prepare(recording: Recording, config: Config) -> Prepared:
     )
     rest = rest & ~at_rail & ~recording.missing.all(axis=1)
     while True:
-        trial, offset = _trial(recording, config, rest, sign)
-        segments, searched = find_segments(rest), without_floor(trial, config)
+        trial, offset, grounded = _trial(recording, config, rest, sign)
+        segments = find_segments(rest)
         # Saturated values may be anything within their bounds here.
-        filtered = filter_recording(searched, trial.signal, trial.unfilled_variance)
-        false = false_rests(searched, segments, filtered)
+        filtered = filter_recording(trial, trial.signal, trial.unfilled_variance)
+        false = false_rests(trial, segments, filtered)
         if not false.any():
             break
         for start, end in zip(segments.arrival[false], segments.rest_end[false], strict=True):
@@ -82,20 +86,42 @@ def _prepare(recording: Recording, config: Config) -> Prepared:
                 f"the rest from {recording.time[start]:.2f} to {recording.time[end]:.2f} s is left out: the motions "
                 "before and after it say that the sensor moved."
             )
-    return Prepared(trial, offset, rails, rest, segments, find_gaps(sign), sign, warnings)
+    return Prepared(trial, grounded, offset, rails, rest, segments, find_gaps(sign), sign, warnings)
 
 
-def without_floor(trial: Trial, config: Config) -> Trial:
-    """An inequality acts on the whole trajectory only: a single segment is searched without it."""
-    if config.height.mode == "nonnegative":
-        return eqx.tree_at(lambda t: t.rows.height, trial, None)
-    return trial
+def constants_sd(config: Config) -> Float[Array, "9"] | None:
+    """None where no constant is wanted."""
+    sd = config.smoother.constants_sd
+    return jnp.asarray(sd) if any(sd) else None
+
+
+def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
+    """The constants that the rests of a recording tell; what saturates may be anything within its bounds."""
+    sd, found = constants_sd(config), Calibration.none()
+    for _ in range(FIRST_STEPS if sd is not None else 0):
+        found = calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, found)
+    return found
+
+
+def find_ground(
+    prepared: Prepared, config: Config, calibration: Calibration | None = None
+) -> Bool[np.ndarray, "P"] | None:
+    """First samples of the rests whose height the whole path is told; the search for δ does without.
+
+    With `height.mode = "auto"` None unless the ground is level. calibration: default `calibrate_by_rests`. To be
+    called within `computing`.
+    """
+    trial, grounded = prepared.trial, prepared.grounded
+    if config.height.mode != "auto" or grounded is None:
+        return grounded
+    known = calibrate_by_rests(trial, config) if calibration is None else calibration
+    return grounded if is_level(trial.calibrated(known), grounded) else None
 
 
 def _trial(
     recording: Recording, config: Config, rest: Bool[np.ndarray, "N"], sign: Int[np.ndarray, "N 6"]
-) -> tuple[Trial, Float[np.ndarray, "3"]]:
-    """The recording as the smoother wants it, and the gyroscope offset that was taken off (rad/s)."""
+) -> tuple[Trial, Float[np.ndarray, "3"], Bool[np.ndarray, "P"] | None]:
+    """The recording as the smoother wants it, the gyroscope offset (rad/s) taken off, and `Prepared.grounded`."""
     n, T, signal = len(recording), recording.period, recording.signal
     started = np.flatnonzero(rest)
     if not len(started):
@@ -140,15 +166,13 @@ def _trial(
     # Tilt is horizontal in the navigation frame; heading and position are the origin of the map.
     prior_covariance = np.diag([tilt, tilt, 0.0, 0.0, 0.0, 0.0, speed, speed, speed])
 
-    height = None
-    if config.height.mode != "off":
-        height = np.zeros(n, bool)
-        arrivals = np.flatnonzero(rest[1:] & ~rest[:-1]) + 1
-        height[arrivals[arrivals > first]] = True
+    # The height of a resting sensor is one, not one a sample.
+    arrived = np.concatenate([[False], rest[1:] & ~rest[:-1]]) & (np.arange(n) > first)
+    mode = config.height.mode
     rows = Rows(
         rest=jnp.asarray(rest),
         velocity_variance=jnp.full(n, noise.rest_velocity_sd**2),
-        height=None if height is None else jnp.asarray(height),
+        height=jnp.asarray(arrived) if mode == "zero" else None,
         height_variance=jnp.full(n, config.height.sd**2),
         velocity=jnp.zeros((n, 3)),
     )
@@ -163,8 +187,9 @@ def _trial(
         prior=jax.tree.map(np.asarray, NavState(q_nb, velocity, jnp.zeros(3))),
         prior_covariance=prior_covariance,
         gravity=np.asarray(gravity),
-    )
-    return trial.padded(), offset
+    ).padded()
+    grounded = pad(arrived, len(trial.signal)) if mode in ("auto", "nonnegative") else None
+    return trial, offset, grounded
 
 
 def _attitude_before(signal, trusted, period: float, rest: Start, config: Config) -> Float[Array, "4"]:

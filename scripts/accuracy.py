@@ -42,7 +42,13 @@ from jaxsat.studies.metrics import (
     pyshoe_error,
 )
 
-METHODS = ("standard", "direct", "map")
+METHODS = {
+    "standard": {"method": "standard"},
+    "direct": {"method": "direct"},
+    "map": {"method": "map"},
+    "free": {"method": "standard", "height.mode": "off"},
+}
+"""Settings of each; `free` is `standard` that does not ask whether the ground is level."""
 RTS = {"rts": None, "rts_spline": "spline"}
 """gaitmap's RtsKalman, and what fills its recording."""
 EVERY = (*METHODS, *FILLS, *RTS)
@@ -82,7 +88,7 @@ def run(recording: Recording, method: str) -> Found:
             position = estimate(mended, load_config(None, **IGNORANT)).trajectory.position
             same = bool((mended.signal == recording.signal).all())
         return Found(method, recording.time, position, lost, gaps, same_as_standard=same)
-    found = estimate(recording, load_config(None, method=method))
+    found = estimate(recording, load_config(None, **METHODS[method]))
     return Found(
         method,
         recording.time,
@@ -208,9 +214,11 @@ def board(table: pd.DataFrame, parts: list[str]) -> Iterator[Row]:
         for method in methods("pyshoe", "saturated"):
             mean = of("pyshoe", "saturated", method, "rmse_3d").mean()
             yield lower(f"pyshoe_mean_3d_{method}", mean, "m", None, f"{saturated}: mean RMSE")
-        every = np.concatenate([of("pyshoe", k, "standard", "pyshoe_3d") for k in ("saturated", "other")])
-        note = "all 26 trials, PyShoe's metric; the best of its five published results per trial: 0.054"
-        yield Row("pyshoe_metric_standard", float(every.mean()), "m", "lower", 0.050, None, note)
+        for method, goal in (("standard", 0.050), ("free", None)):
+            every = np.concatenate([of("pyshoe", k, method, "pyshoe_3d") for k in ("saturated", "other")])
+            note = "all 26 trials, PyShoe's metric; the best of its five published results per trial: 0.054"
+            if len(every):
+                yield Row(f"pyshoe_metric_{method}", float(every.mean()), "m", "lower", goal, None, note)
     if "clipped" in parts:
         whole = of("clipped", "unclipped", "standard", "rmse_3d").mean()
         for rail, goal in ((350, 0.98), (250, 0.95), (200, 0.90)):

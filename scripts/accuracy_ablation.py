@@ -44,6 +44,7 @@ CHANGED = {
     "no noise of changes": {"noise.change": 0.0},
     "rests of 1 cm/s": {"noise.rest_velocity_sd": 0.01},
     "rests of 4 cm/s": {"noise.rest_velocity_sd": 0.04},
+    "heights free": {"height.mode": "off"},
 }
 
 

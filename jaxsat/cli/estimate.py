@@ -74,7 +74,10 @@ def estimate_command(
     segments: Annotated[str | None, typer.Option(help="parallel or sequential", metavar="ORDER")] = None,
     height: Annotated[
         str | None,
-        typer.Option(help="what is known of the height of rests: off, zero or nonnegative", metavar="MODE"),
+        typer.Option(
+            help="height of rests: one where the recording agrees (auto), free (off), zero or nonnegative",
+            metavar="MODE",
+        ),
     ] = None,
     csv: Csv = False,
     quiet: Quiet = False,

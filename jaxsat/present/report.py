@@ -81,7 +81,11 @@ def _facts(estimate: Estimate, summary: Mapping[str, Any]) -> list[tuple[str, st
             f"{int(estimate.saturated.sum()):,}",
             f"in {plural(len(estimate.gaps), 'gap')}; {estimate.saturated.any(axis=1).mean():.1%} of the samples",
         ),
-        ("Rests", f"{rests['count']:,}", f"{rests['share']:.0%} of the time, {rests['source']}"),
+        (
+            "Rests",
+            f"{rests['count']:,}",
+            f"{rests['share']:.0%} of the time, {rests['source']}{'; on level ground' if estimate.level else ''}",
+        ),
         (
             "Start to end",
             f"{moved:.2f} m",

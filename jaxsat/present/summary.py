@@ -53,6 +53,7 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
         "inflated": dict(zip(CHANNELS, fills.inflated.sum(axis=0).tolist(), strict=True)),
         "cost": {"before": float(estimate.cost_standard), "after": float(estimate.cost)},
         "gravity": float(estimate.gravity),
+        "heights": heights_of(estimate),
         "gyr_offset": estimate.gyr_offset.tolist(),
         "bias": dict(zip(CHANNELS, constants[:6], strict=True)),
         "bias_sd": dict(zip(CHANNELS, constants_sd[:6], strict=True)),
@@ -68,6 +69,12 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
         "seconds": estimate.seconds,
         "warnings": warnings_of(estimate),
     }
+
+
+def heights_of(estimate: Estimate) -> str:
+    """What the path was told of the heights of rests: level (as found), free, zero or nonnegative."""
+    mode = estimate.config.height.mode
+    return {"auto": "level" if estimate.level else "free", "off": "free"}.get(mode, mode)
 
 
 def summarise_orientation(found: Orientation, source: Path | None = None) -> dict[str, Any]:

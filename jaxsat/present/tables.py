@@ -110,11 +110,12 @@ def segments_table(estimate: Estimate) -> pd.DataFrame:
 
     Columns: `segment` (its number, as in the trajectory), `start` and `end` (s), `saturated` (values that saturate in
     it), `length` (m, horizontal, from the rest before to the rest after), `climb` (m), their `*_sd`, and `status` of
-    its search as in the gaps' table. Lengths are empty where no rest precedes or follows, their sd also where heights
-    of rests are used. Method map says what the rest after it decides of what was lost: `rank`, in how many directions
-    (of at most six) it removes more than a hundredth of the variance under the signal prior, and `seen`, by what:
-    attitude and velocity on arrival, about and along those axes of the navigation frame where it removes at least a
-    tenth of the sd that it removes on the axis where it removes most.
+    its search as in the gaps' table. Lengths are empty where no rest precedes or follows; their sd, which do not
+    count that the ground is level, also where heights are told to be zero. Method map says what the rest after it
+    decides of what was lost: `rank`, in how many directions (of at most six) it removes more than a hundredth of the
+    variance under the signal prior, and `seen`, by what: attitude and velocity on arrival, about and along those axes
+    of the navigation frame where it removes at least a tenth of the sd that it removes on the axis where it removes
+    most.
     """
     segments, time = estimate.segments, estimate.recording.time
     way, covariance = displacements(estimate)

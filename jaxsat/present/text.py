@@ -89,6 +89,8 @@ def estimate_text(estimate: Estimate, report: Path) -> str:
             f"{estimate.rest.mean():.0%} of the time, with {plural(len(estimate.segments), 'segment')} of motion",
         ],
     ]
+    if estimate.level:
+        rows.append(["ground", "level, as far as the recording can say (--height off: do not assume it)"])
     if searched.any():
         settled = int((status == Status.CONVERGED).sum())
         rows.append(["searches", f"{settled} of {int(searched.sum())} settled on a minimum"])

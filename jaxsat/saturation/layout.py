@@ -37,6 +37,12 @@ class Trial(eqx.Module):
     prior_covariance: Float[Arrays, "p p"]
     gravity: Float[Arrays, ""]
 
+    def on_ground(self, rests: Bool[Arrays, "N"] | None) -> "Trial":
+        """With heights of zero at these rests; None leaves it as it is."""
+        if rests is None:
+            return self
+        return eqx.tree_at(lambda t: t.rows.height, self, jnp.asarray(rests), is_leaf=lambda x: x is None)
+
     @property
     def unfilled_variance(self) -> Float[Arrays, "N 6"]:
         """Of a saturated value while δ is 0: the second moment about that end of what its bounds leave."""

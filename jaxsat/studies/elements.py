@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,8 +20,7 @@ from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import Beside, compiled, stored_jit, usable_cores
 from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
-from jaxsat.pipeline import constants_sd
-from jaxsat.preparation import Prepared
+from jaxsat.preparation import Prepared, constants_sd, find_ground
 from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.compensate import (
     FIRST_STEPS,
@@ -62,6 +62,8 @@ class Case(eqx.Module):
     """A trial as a sweep holds it: padded to the shapes of its bucket."""
 
     trial: Trial
+    grounded: Bool[Arrays, "N"] | None
+    """First samples of the rests whose height the path is told (`find_ground`)."""
     offset: Float[Arrays, "6"]
     """What was taken off the signal: rails act on what the sensor reads."""
     departure: Int[Arrays, "S"]
@@ -88,6 +90,7 @@ def make_case(
     rest_end = np.where(segments.departure >= 0, segments.rest_end, segments.arrival)
     return Case(
         trial=jax.tree.map(np.asarray, trial),
+        grounded=find_ground(prepared, config),
         offset=offset_of(prepared),
         departure=pad(segments.departure[busy], lanes),
         arrival=pad(segments.arrival[busy], lanes),
@@ -164,6 +167,7 @@ def run_elements(
     cases: all of like shapes. size: elements of a chunk, a multiple of the number of local devices, among which they
     are spread. Chunks of one size that hold as many cases share a program.
     """
+    cases = _alike(cases)
     first, *others = chunks(len(cases), grid, size)
 
     def run(chunk: Chunk) -> Scores:
@@ -173,6 +177,14 @@ def run_elements(
     yield first, run(first)
     with Beside(calls_at_once()) as beside:
         yield from zip(others, beside.map(run, others), strict=True)
+
+
+def _alike(cases: Sequence[Case]) -> list[Case]:
+    """Cases that can be stacked: if the ground of one is known, rests of the others are on none."""
+    if all(case.grounded is None for case in cases):
+        return list(cases)
+    nowhere = np.zeros(len(cases[0].trial.signal), bool)
+    return [replace(case, grounded=nowhere) if case.grounded is None else case for case in cases]
 
 
 def _run_chunk(
@@ -221,21 +233,23 @@ def _scores(cases: Case, index, rails, bounds, mesh: Mesh, *settings) -> Scores:
         )
 
     if cases.path is None:
-        path = on_devices(lambda trials: _paths_of_device(trials, wanted, relinearisations), cases.trial)
+        known = cases.trial, cases.grounded
+        path = on_devices(lambda *mine: _paths_of_device(*mine, wanted, relinearisations), *known)
         cases = eqx.tree_at(lambda c: c.path, cases, path, is_leaf=lambda x: x is None)
     elements = jax.tree.map(lambda x: x[index], cases)
     return on_devices(lambda *mine: _scores_of_device(*mine, *settings), elements, rails, bounds)
 
 
 @partial(stored_jit, options=None)
-def _paths_of_device(trials: Trial, wanted, relinearisations) -> Float[Array, "C N 3"]:
+def _paths_of_device(trials: Trial, grounded, wanted, relinearisations) -> Float[Array, "C N 3"]:
     """Of recordings as given, by the standard smoother."""
 
-    def path(trial: Trial):
+    def path(trial: Trial, grounded):
         calibration = _calibration(trial, trial.signal, trial.unfilled_variance, wanted)
-        return _smooth_path(trial, trial.signal, trial.variance, calibration, relinearisations)
+        told = trial.on_ground(grounded)
+        return _smooth_path(told, trial.signal, trial.variance, calibration, relinearisations)
 
-    return _of_each(path, trials)
+    return _of_each(path, trials, grounded)
 
 
 @partial(stored_jit, options=None)
@@ -244,7 +258,7 @@ def _scores_of_device(cases: Case, rails, bounds, *settings) -> Scores:
 
 
 def _of_each(function: Callable, *over):
-    """`vmap`; on a CPU a loop: filters of one trial are one program there, and what they keep fits its caches."""
+    """`vmap`; on a CPU a loop: filters of one trial are one program there and keep within its caches."""
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda each: function(*each), over)
     return jax.vmap(function)(*over)
@@ -299,9 +313,10 @@ def score(
         }
 
     found, at, unfilled = {}, jnp.maximum(case.departure, 0), trial.unfilled_variance
+    told = trial.on_ground(case.grounded)
     first = _calibration(trial, signal, unfilled, wanted)
     if standard:
-        path = _smooth_path(trial, signal, trial.variance, first, relinearisations)
+        path = _smooth_path(told, signal, trial.variance, first, relinearisations)
         found["standard"] = compared(path, signal)
     bare = None if wanted is not None or not options else _table(case, trial)
     for option, passes in zip(options, sweeps, strict=True):
@@ -336,7 +351,7 @@ def score(
         begin = (signal, unfilled, unfilled, first, first_prior)
         (filled, _, slack, calibration, _), every = jax.lax.scan(once, begin, None, length=passes)
         fill, values = jax.tree.map(lambda x: x[-1], every)
-        path = _smooth_path(trial, filled, trial.variance + slack, calibration, relinearisations)
+        path = _smooth_path(told, filled, trial.variance + slack, calibration, relinearisations)
         busy = jnp.any(values.sample < count, axis=1)
         order = jnp.asarray([_SEVERITY.index(status) for status in sorted(Status)])
         worst = jnp.max(jnp.where(busy, order[fill.solution.status], 0))
@@ -377,12 +392,5 @@ def _smooth_path(
     trial: Trial, signal, variance, calibration: Calibration, relinearisations
 ) -> Float[Array, "N 3"]:
     samples, rows = calibration.applied(Samples(signal, jnp.asarray(trial.period), variance), trial.rows)
-    smoothed = smooth(
-        samples,
-        rows,
-        trial.prior,
-        jnp.asarray(trial.prior_covariance),
-        jnp.asarray(trial.gravity),
-        relinearisations,
-    )
-    return smoothed.state.position[:-1]
+    known = trial.prior, jnp.asarray(trial.prior_covariance), jnp.asarray(trial.gravity)
+    return smooth(samples, rows, *known, relinearisations).state.position[:-1]

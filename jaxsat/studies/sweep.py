@@ -199,10 +199,11 @@ def _batches(loaders: Mapping[str, Loader], plan: _Plan) -> tuple[list[_Batch], 
             max(int(values.max(initial=1)) for _, values in counts),
             factor=2,
         )
-        cases = [
-            make_case(prepared, np.flatnonzero(values), lanes, plan.config)
-            for (_, prepared, _), (_, values) in zip(items, counts, strict=True)
-        ]
+        with on_processor():
+            cases = [
+                make_case(prepared, np.flatnonzero(values), lanes, plan.config)
+                for (_, prepared, _), (_, values) in zip(items, counts, strict=True)
+            ]
         batches.append(_Batch(cases, [name for name, _, _ in items], sizes))
     return batches, failed
 

@@ -30,8 +30,7 @@ from jaxsat.inertial.strapdown import (
     sample_intervals,
     sample_noise,
 )
-from jaxsat.pipeline import calibrate_by_rests
-from jaxsat.preparation import prepare, without_floor
+from jaxsat.preparation import calibrate_by_rests, prepare
 from jaxsat.saturation.layout import Trial, pad
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.metrics import Track
@@ -146,7 +145,7 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
     """
     with computing():
         prepared = prepare(recording, config)
-        known = calibrate_by_rests(without_floor(prepared.trial, config), config)
+        known = calibrate_by_rests(prepared.trial, config)
         trial = jax.tree.map(np.asarray, prepared.trial.calibrated(known))
     n, size = len(recording), len(prepared.trial.signal)
     extra = prepared.trial.variance[:n] - np.array(config.noise.densities) ** 2 / recording.period
