@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 from accuracy_figures import draw_ratios, draw_trial
 from jaxtyping import Float
+from paper.drawing import STYLES
 from peers import MissingPeer, import_peer
 from peers.fills import FILLS, filled
 from peers.gaitmap_rts import rts_kalman
@@ -298,7 +299,7 @@ def draw(folder: Path, table: pd.DataFrame, paths: dict[tuple[str, str, str], tu
     errors = saturated.pivot(index="trial", columns="method", values="rmse_3d")
     if "map" not in errors:
         return
-    shown = [method for method in EVERY[1:] if method in errors]
+    shown = [method for method in EVERY[1:] if method in errors and method in STYLES]
     ratios = pd.DataFrame({method: errors[method] / errors["standard"] for method in shown}).sort_values(
         "map"
     )
