@@ -99,6 +99,37 @@ def test_given_rests_pass_through():
     assert np.array_equal(find_rests(recording(gyr, acc, rest=given)), given)
 
 
+def stepping(stances: list[tuple[float, float]], swing: float = 10.0) -> tuple[Recording, np.ndarray]:
+    """Stances (s, rad/s), each followed by a swing of 0.6 s; and which stance a sample belongs to, -1 in swings."""
+    bump = swing * np.sin(np.pi * (np.arange(120) + 0.5) / 120)
+    rates, which = [], []
+    for k, (seconds, rate) in enumerate(stances):
+        stance = np.full(round(seconds / PERIOD), rate)
+        rates += [stance, np.maximum(bump, rate)]
+        which += [np.full(len(stance), k), np.full(120, -1)]
+    rate = np.concatenate(rates)
+    gyr = np.stack([0 * rate, rate, 0 * rate], axis=1)
+    return recording(gyr, np.tile([0.0, 0.0, 9.81], (len(rate), 1))), np.concatenate(which)
+
+
+def test_the_stances_of_a_runner_rest_though_they_are_livelier():
+    strides = [(0.2, 0.5)] * 8 + [(0.06, 1.2)] * 6 + [(0.2, 0.5)] * 3
+    runner, which = stepping(strides)
+    rest, given = find_rests(runner), find_rests(runner, threshold=1.0)
+    assert set(which[rest]) - {-1} == set(range(len(strides)))
+    assert np.abs(runner.gyr[rest]).max() < 1.5
+    assert set(which[given]) - {-1} == set(range(len(strides))) - set(range(8, 14))
+    # Not where the foot hardly swings beside them, nor where there are no strides to compare with.
+    slow, _ = stepping(strides[8:14], swing=3.0)
+    first, last = (which == 8).argmax(), (which == 14).argmax()
+    shuffling = runner.gyr.copy()
+    shuffling[first : first + len(slow)] = slow.gyr
+    assert first + len(slow) == last
+    assert not find_rests(recording(shuffling, runner.acc))[first + 20 : last - 20].any()
+    few, which = stepping(strides[5:11])
+    assert not (set(which[find_rests(few)]) & {3, 4, 5})
+
+
 def test_saturated_and_unmeasured_samples_never_rest():
     gyr, acc = still(1000)
     saturated = np.zeros(1000, bool)

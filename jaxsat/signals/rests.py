@@ -20,6 +20,13 @@ LIVELIEST_REST = {"shoe": 1.0, "ared": 1.0, "amvd": 3.0, "mag": 3.0}
 # A walker takes a stride in 1.0 to 1.4 s, a runner in 0.7 s; a swing is ten times livelier than a stance.
 STRIDE, CONTRAST = 1.5, 10.0
 
+# From rest to rest a stride takes no longer than this (s). A runner's stance is at least so long and no closer to the
+# next (s), and at most so much livelier than other rests (as a mean square); before and after it the foot swings so
+# much livelier than it stands, and at least half as lively as in other strides.
+LONGEST_SWING, SHORTEST_STANCE, CLOSEST_STANCES, LIVELIER_STANCE, STANCE_CONTRAST = 1.2, 0.025, 0.3, 2.0, 50.0
+# So many strides say how lively the others are.
+FEWEST_STRIDES = 5
+
 # A rest of at least this length (s) says what a gyroscope reads when nothing turns, and how sure that is by the means
 # of blocks of about `BLOCK`: who wears a sensor sways and settles within half a second.
 SHORTEST_OFFSET_REST, BLOCK = 1.0, 0.5
@@ -114,22 +121,70 @@ def find_rests(
 ) -> Bool[np.ndarray, "N"]:
     """Samples at which the sensor rests; flags that came with the recording pass through unchanged.
 
-    `threshold` is on `detector_statistic`, "auto" takes `rest_threshold`; `window` and `min_duration` in s.
-    Rests shorter than `min_duration` are dropped; saturated and unmeasured samples never rest.
+    `threshold` is on `detector_statistic`, "auto" takes `rest_threshold` and looks for the stances of a runner where
+    it leaves motions that are too long for a stride; `window` and `min_duration` in s. Rests shorter than
+    `min_duration` are dropped; saturated and unmeasured samples never rest.
     """
     if recording.rest is not None:
         return recording.rest
     period = recording.period
     statistic = detector_statistic(detector, recording.gyr, recording.acc, period, window)
     limit = rest_threshold(statistic, period, detector) if threshold == "auto" else threshold
-    rest = (statistic <= limit) & ~recording.missing.all(axis=1)
+    possible = ~recording.missing.all(axis=1)
     if saturated is not None:
-        rest &= ~saturated
-    start, end = runs(rest)
+        possible &= ~saturated
+    start, end = runs((statistic <= limit) & possible)
     long = end - start >= round(min_duration / period)
-    change = np.zeros(len(rest) + 1, int)
+    change = np.zeros(len(possible) + 1, int)
     change[start[long]], change[end[long]] = 1, -1
-    return np.cumsum(change[:-1]).astype(bool)
+    rest = np.cumsum(change[:-1]).astype(bool)
+    # Walkers' thresholds are less than half of what rests may reach (PyShoe), runners' stances lie at it and beyond.
+    liveliest = LIVELIEST_REST[detector] ** 2
+    if threshold == "auto" and limit > 0.5 * liveliest:
+        rest |= _running_stances(statistic, rest, possible, period, liveliest)
+    return rest
+
+
+def _running_stances(
+    statistic: Float[np.ndarray, "N"],
+    rest: Bool[np.ndarray, "N"],
+    possible: Bool[np.ndarray, "N"],
+    period: float,
+    liveliest: float,
+) -> Bool[np.ndarray, "N"]:
+    """Stances within motions that are too long for a stride: a runner's foot stands for some hundredths of a second.
+
+    liveliest: statistic of a rest at most. None where there are hardly any strides to compare with.
+    """
+    found, motions = np.zeros(len(rest), bool), find_segments(rest)
+    spans = list(zip(np.maximum(motions.departure, 0).tolist(), motions.arrival.tolist(), strict=True))
+    swings = [statistic[a:b].max() for a, b in spans if (b - a) * period <= LONGEST_SWING]
+    if len(swings) < FEWEST_STRIDES:
+        return found
+    lively = 0.5 * np.median(swings)
+    apart, swing = (round(x / period) for x in (CLOSEST_STANCES, 0.5 * LONGEST_SWING))
+    for a, b in spans:
+        if (b - a) * period <= LONGEST_SWING:
+            continue
+        x, last = statistic[a:b], 0
+        starts, ends = runs((x <= LIVELIER_STANCE * liveliest) & possible[a:b])
+        for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+            middle = start + int(np.argmin(x[start:end]))
+            before, after = (
+                y.max(initial=0.0) for y in (x[max(last, start - swing) : start], x[end : end + swing])
+            )
+            # Its edges are livelier: what is about as quiet as its middle stands.
+            first, stop = runs(x[start:end] <= max(liveliest, 1.5 * x[middle]))
+            part = int(np.searchsorted(start + first, middle, side="right")) - 1
+            if (
+                start - last >= apart
+                and len(x) - end >= apart
+                and (stop - first)[part] * period >= SHORTEST_STANCE
+                and min(before, after) >= max(lively, STANCE_CONTRAST * x[middle])
+            ):
+                last = end
+                found[a + start + first[part] : a + start + stop[part]] = True
+    return found
 
 
 def find_segments(rest: Bool[np.ndarray, "N"]) -> Segments:
