@@ -17,7 +17,7 @@ from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
 from jaxsat.saturation.compensate import FIRST_STEPS, calibrate_recording, filter_recording
 from jaxsat.saturation.false_rests import false_rests
 from jaxsat.saturation.layout import Trial, pad
-from jaxsat.saturation.level_ground import is_level
+from jaxsat.saturation.level_ground import ROW, is_level
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording, sensor_changes
@@ -40,7 +40,7 @@ class Prepared(eqx.Module):
     trial: Trial
     """Padded."""
     grounded: Bool[np.ndarray, "P"] | None
-    """First samples of rests that may be on the ground, padded; None where the ground is not asked for."""
+    """First samples of rests that may be on the ground, padded; None where it is not asked for, or by too few."""
     gyr_offset: Float[np.ndarray, "3"]
     """What was taken off the rates (rad/s)."""
     rails: Rails
@@ -188,8 +188,8 @@ def _trial(
         prior_covariance=prior_covariance,
         gravity=np.asarray(gravity),
     ).padded()
-    grounded = pad(arrived, len(trial.signal)) if mode in ("auto", "nonnegative") else None
-    return trial, offset, grounded
+    asked = mode == "nonnegative" or (mode == "auto" and arrived.sum() >= ROW)
+    return trial, offset, pad(arrived, len(trial.signal)) if asked else None
 
 
 def _attitude_before(signal, trusted, period: float, rest: Start, config: Config) -> Float[Array, "4"]:

@@ -15,19 +15,17 @@ from jaxsat.saturation.layout import Trial
 ROW = 10
 # By how much the height of a rest may raise J*, on average over so many in a row and alone: half the square of its
 # misfit in sd. The given walks, all of them level, reach 8 and 18, all but one 6 and 12. Made to climb 2 % of their
-# way they reach 10 to 50 in a row, at a curb of 17 cm 27 to 156 alone, on stairs 300 and 950 at least; about half of
-# the slopes of 1 % and most curbs of 10 cm are told from drift. Crawls, which lift a knee by 20 cm, reach 33 and 195.
+# way they reach 10 to 50 in a row, at a curb of 17 cm 27 to 156 alone, on stairs 300 and 950 at least; most
+# slopes of 1 % and curbs of 10 cm are told from drift. Crawls, which lift a knee by 20 cm, reach 33 and 195.
 MOST_IN_ROW, MOST_ALONE = 9.0, 24.0
 
 
 def is_level(trial: Trial, grounded: Bool[np.ndarray, "N"]) -> bool:
-    """Whether these rests are at one height, as far as the recording can say; of fewer than `ROW` it cannot.
+    """Whether these rests are at one height, as far as the recording can say.
 
-    trial: calibrated; grounded: the first samples of its rests.
+    trial: calibrated; grounded: the first samples of its rests, `ROW` of them at least.
     """
     arrivals = np.flatnonzero(grounded)
-    if len(arrivals) < ROW:
-        return False
     # Saturated values may be anything within their bounds here.
     free, told = (
         np.asarray(filter_recording(t, t.signal, t.unfilled_variance).cost)

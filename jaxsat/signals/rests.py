@@ -130,9 +130,8 @@ def find_rests(
     period = recording.period
     statistic = detector_statistic(detector, recording.gyr, recording.acc, period, window)
     limit = rest_threshold(statistic, period, detector) if threshold == "auto" else threshold
-    possible = ~recording.missing.all(axis=1)
-    if saturated is not None:
-        possible &= ~saturated
+    barred = np.all(recording.missing, axis=1)
+    possible = ~(barred if saturated is None else barred | saturated)
     start, end = runs((statistic <= limit) & possible)
     long = end - start >= round(min_duration / period)
     change = np.zeros(len(possible) + 1, int)

@@ -233,8 +233,11 @@ def _scores(cases: Case, index, rails, bounds, mesh: Mesh, *settings) -> Scores:
         )
 
     if cases.path is None:
-        known = cases.trial, cases.grounded
-        path = on_devices(lambda *mine: _paths_of_device(*mine, wanted, relinearisations), *known)
+
+        def paths(trials: Trial, grounded):
+            return _paths_of_device(trials, grounded, wanted, relinearisations)
+
+        path = on_devices(paths, cases.trial, cases.grounded)
         cases = eqx.tree_at(lambda c: c.path, cases, path, is_leaf=lambda x: x is None)
     elements = jax.tree.map(lambda x: x[index], cases)
     return on_devices(lambda *mine: _scores_of_device(*mine, *settings), elements, rails, bounds)
