@@ -145,7 +145,7 @@ def _plan(
     if config.saturation.segments != "parallel" or config.height.mode == "nonnegative":
         raise InputError(
             "a sweep solves segments in parallel and knows no inequality; set saturation.segments to parallel "
-            "and height.mode to off or zero."
+            "and height.mode to auto, off or zero."
         )
     if not memory > 0:
         raise InputError(f"a memory of {memory / 1e9:g} GB cannot be; give a positive number.")
