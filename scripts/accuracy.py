@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import accuracy_intervals
+import accuracy_scores
 import numpy as np
 import pandas as pd
 from accuracy_figures import draw_ratios, draw_trial
+from accuracy_tracked import point_of, pyshoe_point
 from jaxtyping import Float
 from paper.drawing import STYLES
 from peers import MissingPeer, import_peer
@@ -34,14 +36,14 @@ from jaxsat.pipeline import estimate
 from jaxsat.preparation import prepare
 from jaxsat.signals.readers import read
 from jaxsat.signals.recording import Recording
-from jaxsat.studies.boards import Row, read_board, worse, write_board
+from jaxsat.studies.boards import read_board, worse, write_board
 from jaxsat.studies.metrics import (
-    geometric_mean_ratio,
     load_gaitmap_truth,
     load_pyshoe_truth,
     position_rmse,
     pyshoe_error,
 )
+from jaxsat.studies.tracked_point import TrackedPoint
 
 METHODS = {
     "standard": {"method": "standard"},
@@ -71,10 +73,20 @@ class Found(NamedTuple):
     method: str
     time: Float[np.ndarray, "N"]
     position: Float[np.ndarray, "N 3"]
+    q_nb: Float[np.ndarray, "N 4"] | None
     saturated: int
     gaps: int
     not_converged: int = 0
     same_as_standard: bool = True
+
+
+class Truth(NamedTuple):
+    """What an estimate is scored against."""
+
+    time: Float[np.ndarray, "M"]
+    position: Float[np.ndarray, "M 3"]
+    point: TrackedPoint | None = None
+    """Where on the sensor it was measured; None where that is the sensor itself."""
 
 
 def run(recording: Recording, method: str) -> Found:
@@ -84,16 +96,18 @@ def run(recording: Recording, method: str) -> Found:
         fill = RTS.get(method, method)
         mended = recording if fill is None else filled(recording, prepared, fill)
         if method in RTS:
-            position, same = rts_kalman(mended, prepared), False
+            position, q_nb, same = rts_kalman(mended, prepared), None, False
         else:
-            position = estimate(mended, load_config(None, **IGNORANT)).trajectory.position
+            made = estimate(mended, load_config(None, **IGNORANT)).trajectory
+            position, q_nb = made.position, made.q_nb
             same = bool((mended.signal == recording.signal).all())
-        return Found(method, recording.time, position, lost, gaps, same_as_standard=same)
+        return Found(method, recording.time, position, q_nb, lost, gaps, same_as_standard=same)
     found = estimate(recording, load_config(None, **METHODS[method]))
     return Found(
         method,
         recording.time,
         found.trajectory.position,
+        found.trajectory.q_nb,
         int(found.saturated.sum()),
         len(found.gaps),
         int((found.fills.status == 1).sum()),
@@ -111,7 +125,9 @@ def pyshoe(data: Path, methods: tuple[str, ...]) -> list[dict]:
     splits = tomllib.loads((folder / "splits.toml").read_text())
     for name in sorted(path.stem for path in folder.glob("*.mat")):
         recording = read(folder / f"{name}.mat", rest_column="zv_shoe_opt")
-        _, truth = load_pyshoe_truth(folder / f"{name}.mat", at=recording.time)
+        truth = Truth(
+            *load_pyshoe_truth(folder / f"{name}.mat", at=recording.time), pyshoe_point(folder, name)
+        )
         kind = "saturated" if name in splits["saturated"] else "other"
         # Without saturation a fill is the standard smoother.
         here = methods if kind == "saturated" else tuple(m for m in methods if m in METHODS)
@@ -127,7 +143,9 @@ def clipped(data: Path, methods: tuple[str, ...]) -> list[dict]:
     folder, rows = data / "pyshoe", []
     for name in tomllib.loads((folder / "splits.toml").read_text())["clip"]:
         recording = read(folder / f"{name}.mat", rest_column="zv_shoe_opt")
-        _, truth = load_pyshoe_truth(folder / f"{name}.mat", at=recording.time)
+        truth = Truth(
+            *load_pyshoe_truth(folder / f"{name}.mat", at=recording.time), pyshoe_point(folder, name)
+        )
         if "standard" in methods:
             rows.append(row("clipped", name, "unclipped", run(recording, "standard"), truth))
         for rail in (350, 250, 200):
@@ -142,11 +160,11 @@ def gaitmap(data: Path, methods: tuple[str, ...]) -> list[dict]:
         path = data / "gaitmap" / "imu_sample_not_rotated.csv"
         recording = read(path, sensor=f"{side}_sensor")
         markers = [f"{side[0].upper()}_{marker}" for marker in MARKERS]
-        time, truth = load_gaitmap_truth(data / "gaitmap" / "mocap_sample.csv", markers)
+        track = load_gaitmap_truth(data / "gaitmap" / "mocap_sample.csv", markers)
+        truth = Truth(*track, point_of(recording, *track))
         for kind, rails in (("unclipped", {}), ("300 °/s", {"gyr": 300}), ("8 g", {"acc": 8})):
-            for found in runs(clip(recording, **rails), methods):
-                at = np.stack([np.interp(time, found.time, axis) for axis in found.position.T], axis=1)
-                rows.append(row("gaitmap", side, kind, found._replace(time=time, position=at), truth))
+            found = runs(clip(recording, **rails), methods)
+            rows += [row("gaitmap", side, kind, each, truth) for each in found]
     return rows
 
 
@@ -155,21 +173,30 @@ MARKERS = ("FCC", "TOE", "FM5")
 
 def against_itself(part: str, path: Path, rails: tuple[int, ...], methods: tuple[str, ...]) -> list[dict]:
     recording, rows = read(path), []
-    truth = run(recording, "standard").position
+    truth = Truth(recording.time, run(recording, "standard").position)
     for rail in rails:
         found = runs(clip(recording, gyr=rail), methods)
         rows += [row(part, path.stem, f"{rail} °/s", each, truth, align=False) for each in found]
     return rows
 
 
-def row(part: str, trial: str, kind: str, found: Found, truth, align: bool = True) -> dict:
-    position = found.position
+def row(part: str, trial: str, kind: str, found: Found, truth: Truth, align: bool = True) -> dict:
+    time, there, point = truth
+
+    def at_truth(path: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
+        return np.stack([np.interp(time, found.time, axis) for axis in path.T], axis=1)
+
+    position = at_truth(found.position)
     scores = {
-        "rmse_3d": position_rmse(position, truth, align=align),
-        "rmse_2d": position_rmse(position, truth, axes=2, align=align),
-        "rmse_z": rms_height(position, truth),
-        "pyshoe_3d": pyshoe_error(position, truth, align=align),
+        "rmse_3d": position_rmse(position, there, align=align),
+        "rmse_2d": position_rmse(position, there, axes=2, align=align),
+        "rmse_z": rms_height(position, there),
+        "pyshoe_3d": pyshoe_error(position, there, align=align),
     }
+    if point is not None and found.q_nb is not None:
+        tracked = at_truth(point.path(found.time, found.position, found.q_nb))
+        scores["tracked_3d"] = position_rmse(tracked, there)
+        scores["tracked_2d"] = position_rmse(tracked, there, axes=2)
     print(part, trial, kind, found.method, f"{scores['rmse_3d']:.3f}", flush=True)
     return {
         **dict(zip(KEY, (part, trial, kind, found.method), strict=True)),
@@ -178,75 +205,13 @@ def row(part: str, trial: str, kind: str, found: Found, truth, align: bool = Tru
         "gaps": found.gaps,
         "not_converged": found.not_converged,
         "same_as_standard": found.same_as_standard,
-        "path": (found.time, position, truth),
+        "path": (time, position, there),
     }
 
 
 def rms_height(position, truth) -> float:
     away = position[:, 2] - truth[:, 2]
     return float(np.sqrt(np.mean((away - away.mean()) ** 2)))
-
-
-def board(table: pd.DataFrame, parts: list[str]) -> Iterator[Row]:
-    def of(part, kind, method, column, trial=None) -> np.ndarray:
-        at = (table["part"] == part) & (table["kind"] == kind) & (table["method"] == method)
-        if trial is not None:
-            at &= table["trial"] == trial
-        return table.loc[at].set_index("trial")[column].sort_index().to_numpy()
-
-    def methods(part, kind) -> list[str]:
-        there = set(table.loc[(table["part"] == part) & (table["kind"] == kind), "method"])
-        return [method for method in EVERY if method in there]
-
-    def lower(metric, value, unit, goal, note) -> Row:
-        return Row(metric, float(value), unit, "lower", goal if metric.endswith("_map") else None, None, note)
-
-    if "pyshoe" in parts:
-        saturated = "12 saturated trials"
-        for kind, name in (("saturated", ""), ("own rests", "own_rests_")):
-            for method in methods("pyshoe", kind)[1:]:
-                for column, axes in (("rmse_3d", "3d"), ("rmse_2d", "2d")):
-                    mine, theirs = (of("pyshoe", kind, m, column) for m in (method, "standard"))
-                    ratio, what = geometric_mean_ratio(mine, theirs), f"{saturated}, {kind}"
-                    metric = f"pyshoe_ratio_{axes}_{name}{method}"
-                    yield lower(metric, ratio, "1", 0.70, f"{what}: geometric mean of the ratio to standard")
-                    metric = f"pyshoe_worst_{axes}_{name}{method}"
-                    yield lower(metric, (mine / theirs).max(), "1", 1.02, f"{what}: worst of these ratios")
-        for method in methods("pyshoe", "saturated"):
-            mean = of("pyshoe", "saturated", method, "rmse_3d").mean()
-            yield lower(f"pyshoe_mean_3d_{method}", mean, "m", None, f"{saturated}: mean RMSE")
-        for method, goal in (("standard", 0.050), ("free", None)):
-            every = np.concatenate([of("pyshoe", k, method, "pyshoe_3d") for k in ("saturated", "other")])
-            note = "all 26 trials, PyShoe's metric; the best of its five published results per trial: 0.054"
-            if len(every):
-                yield Row(f"pyshoe_metric_{method}", float(every.mean()), "m", "lower", goal, None, note)
-    if "clipped" in parts:
-        whole = of("clipped", "unclipped", "standard", "rmse_3d").mean()
-        for rail, goal in ((350, 0.98), (250, 0.95), (200, 0.90)):
-            kind = f"{rail} °/s"
-            lost = of("clipped", kind, "standard", "rmse_3d").mean()
-            note = (
-                f"share of what clipping loses that comes back; unclipped {whole:.3f} m, ignored {lost:.3f} m"
-            )
-            for method in methods("clipped", kind)[1:]:
-                share = 1 - (of("clipped", kind, method, "rmse_3d").mean() - whole) / (lost - whole)
-                goal_here = goal if method == "map" else None
-                yield Row(f"recovered_{rail}_{method}", float(share), "1", "higher", goal_here, None, note)
-    for kind, column, name, goals in (
-        ("300 °/s", "rmse_2d", "300dps_xy", {"left": 0.16, "right": 0.16}),
-        ("8 g", "rmse_z", "8g_z", {"left": 0.31, "right": 0.22}),
-    ):
-        for side, goal in goals.items() if "gaitmap" in parts else ():
-            without = of("gaitmap", "unclipped", "standard", column, side)[0]
-            for method in methods("gaitmap", kind):
-                value = of("gaitmap", kind, method, column, side)[0]
-                note = f"RMS to motion capture; unclipped {without:.3f} m"
-                yield lower(f"gaitmap_{side}_{name}_{method}", value, "m", goal, note)
-    for part, goals in (("openshoe", {350: 0.10, 300: 0.20}), ("xio", {500: 0.05, 400: 0.15})):
-        for rail, goal in goals.items() if part in parts else ():
-            for method in methods(part, f"{rail} °/s"):
-                value = of(part, f"{rail} °/s", method, "rmse_3d")[0]
-                yield lower(f"{part}_{rail}_{method}", value, "m", goal, "RMS to its own unclipped path")
 
 
 PARTS = {
@@ -348,7 +313,7 @@ def main() -> int:
     for part in parts:
         if "standard" not in set(table.loc[table["part"] == part, "method"]):
             raise InputError(f"{part}: there is no row of standard to compare with; add it to --methods.")
-    rows = {r.metric: r for r in former} | {r.metric: r for r in board(table, parts)}
+    rows = {r.metric: r for r in former} | {r.metric: r for r in accuracy_scores.board(table, parts, EVERY)}
     held = intervals(arguments.data) if "intervals" in arguments.only else None
     if held is not None:
         rows |= {r.metric: r for r in accuracy_intervals.board(held)}

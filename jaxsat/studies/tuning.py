@@ -20,6 +20,7 @@ from jaxsat.errors import InputError
 from jaxsat.inertial import kalman
 from jaxsat.inertial.orientation import Direction, Estimate, Gains, Start, orientation, up_in_body
 from jaxsat.inertial.programs import compiled, computing
+from jaxsat.inertial.rotations import quat_rotate
 from jaxsat.inertial.smoother import Rows, smooth, update_rows
 from jaxsat.inertial.strapdown import (
     NavState,
@@ -34,6 +35,7 @@ from jaxsat.preparation import calibrate_by_rests, find_ground, prepare
 from jaxsat.saturation.layout import Trial, pad
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.metrics import Track
+from jaxsat.studies.tracked_point import find_tracked_point
 
 Logs = Float[Array, "P"]
 
@@ -116,6 +118,8 @@ class NoiseTrial(eqx.Module):
     """Of the reference (m)."""
     scored: Bool[np.ndarray, "N"]
     """Where there is one."""
+    lever: Float[np.ndarray, "3"]
+    """From the sensor to the point that it is of, in the body frame (m)."""
 
     def problem(self, noise: Float[Array, "3"]) -> tuple[Samples, Rows, NavState, Float[Array, "9 9"], Array]:
         """What the smoother is asked with this noise: gyr_density, acc_density, rest_velocity_sd."""
@@ -141,7 +145,8 @@ class NoiseTrial(eqx.Module):
 def noise_trial(recording: Recording, config: Config, truth: Track | None = None) -> NoiseTrial:
     """A recording prepared for `rest_misfit` and `position_loss`; raises `InputError` as `estimate` does.
 
-    truth: times (s) and positions (m); samples that they do not cover are not scored.
+    truth: times (s) and positions (m); samples that they do not cover are not scored. They are those of the point
+    that motion capture tracks, which is found as seen from the path by the noise of `config`.
     """
     with computing():
         prepared = prepare(recording, config)
@@ -151,26 +156,40 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
         trial = jax.tree.map(np.asarray, prepared.trial.calibrated(known).on_ground(ground))
     n, size = len(recording), len(prepared.trial.signal)
     extra = prepared.trial.variance[:n] - np.array(config.noise.densities) ** 2 / recording.period
-    position, scored = np.zeros((n, 3)), np.zeros(n, bool)
-    if truth is not None:
-        time, track = truth
-        scored = (recording.time >= time[0]) & (recording.time <= time[-1])
-        position = np.stack([np.interp(recording.time, time, axis) for axis in track.T], axis=1)
-        if not scored.any():
-            raise InputError(
-                f"{recording.name}: motion capture from {time[0]:.3f} to {time[-1]:.3f} s covers none of the "
-                f"recording's {recording.time[0]:.3f} to {recording.time[-1]:.3f} s; put both on one clock."
-            )
-    return NoiseTrial(
+    made = NoiseTrial(
         trial,
         pad(~recording.missing, size),
         pad(extra, size),
         np.array(config.noise.axes),
         np.asarray(prepared.rest[0]),
         np.asarray(config.smoother.relinearisations),
-        pad(position, size),
-        pad(scored, size),
+        np.zeros((size, 3)),
+        np.zeros(size, bool),
+        np.zeros(3),
     )
+    return made if truth is None else _against(made, recording, truth, config)
+
+
+def _against(made: NoiseTrial, recording: Recording, truth: Track, config: Config) -> NoiseTrial:
+    """With the reference that its positions are scored against."""
+    (time, track), own = truth, recording.time
+    scored = (own >= time[0]) & (own <= time[-1])
+    if not scored.any():
+        raise InputError(
+            f"{recording.name}: motion capture from {time[0]:.3f} to {time[-1]:.3f} s covers none of the "
+            f"recording's {own[0]:.3f} to {own[-1]:.3f} s; put both on one clock."
+        )
+
+    def reference(at: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K 3"]:
+        return np.stack([np.interp(at, time, axis) for axis in track.T], axis=1)
+
+    noise = config.noise
+    start = jnp.asarray([noise.gyr_density, noise.acc_density, noise.rest_velocity_sd], float)
+    state = jax.tree.map(lambda x: np.asarray(x)[: len(own)][scored], jax.jit(_path)(made, start))
+    point = find_tracked_point(own[scored], state.position, state.q_nb, reference(own[scored]))
+    size = len(made.scored)
+    changed = pad(reference(own + point.lag), size), pad(scored, size), point.lever
+    return eqx.tree_at(lambda m: (m.position, m.scored, m.lever), made, changed)
 
 
 def rest_misfit(trial: NoiseTrial, noise: Float[Array, "3"]) -> Float[Array, ""]:
@@ -201,9 +220,19 @@ def rest_misfit(trial: NoiseTrial, noise: Float[Array, "3"]) -> Float[Array, ""]
     return total
 
 
+def _path(trial: NoiseTrial, noise: Float[Array, "3"]) -> NavState:
+    """By the standard smoother, at the starts of samples."""
+    state = smooth(*trial.problem(noise), jnp.asarray(trial.relinearisations)).state
+    return jax.tree.map(lambda x: x[:-1], state)
+
+
 def position_loss(trial: NoiseTrial, noise: Float[Array, "3"]) -> Float[Array, ""]:
-    """Mean squared position error of the standard smoother (m²), turned about z and shifted onto the reference."""
-    found = smooth(*trial.problem(noise), jnp.asarray(trial.relinearisations)).state.position[:-1]
+    """Mean squared position error (m²) by the standard smoother, turned about z and shifted onto the reference.
+
+    Of the point that the reference is of.
+    """
+    state = _path(trial, noise)
+    found = state.position + jax.vmap(quat_rotate, (0, None))(state.q_nb, jnp.asarray(trial.lever))
     weight = jnp.where(trial.scored, 1.0, 0.0)[:, None] / jnp.sum(trial.scored, dtype=found.dtype)
     true = jnp.asarray(trial.position)
     centred, truth = (x - jnp.sum(weight * x, axis=0)[None] for x in (found, true))
