@@ -45,6 +45,11 @@ class Noise(_Section):
     rest_velocity_sd: float = Field(
         default=0.02, gt=0, description="sd of the velocity of a resting sensor (m/s)"
     )
+    rest_steady: float = Field(
+        default=0.5,
+        ge=0,
+        description="that velocity stays alike for so long (s), which counts in what sd are claimed; 0: white",
+    )
     initial_tilt_sd: float = Field(
         default=0.005, gt=0, description="sd of the initial tilt, mostly accelerometer bias (rad)"
     )
@@ -139,7 +144,8 @@ class Smoother(_Section):
     lever_sd: float = Field(
         default=0.1,
         ge=0,
-        description="prior sd of each axis of the lever from the sensor to the point that stands still (m); 0: none",
+        description="prior sd of each axis of the lever from the sensor to the point that stands still, and of how "
+        "far that point wanders (m); 0: none",
     )
 
     @property

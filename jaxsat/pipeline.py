@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import cast
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -17,14 +17,13 @@ from jaxsat.inertial.programs import Beside, computing, stored_jit
 from jaxsat.inertial.smoother import (
     ActiveSet,
     Rows,
-    Smoothed,
     displacement_covariance,
     smooth,
     smooth_about,
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.preparation import calibrate_by_rests, constants_sd, find_ground, prepare
+from jaxsat.preparation import calibrate_by_rests, constants_sd, find_ground, prepare, with_rests_in_doubt
 from jaxsat.saturation.compensate import (
     Fills,
     compensate_parallel,
@@ -147,7 +146,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         clock.lap("calibration")
         sure = trial.calibrated(calibration)
         ground = beside.submit(find_ground, prepared, config, calibration)
-        ignoring = beside.submit(lambda trial: _smooth(trial.on_ground(ground.result()), config), sure)
+        ignoring = beside.submit(lambda trial: _path(trial.on_ground(ground.result()), config), sure)
         compensated = None
         if options is not None and learning is not None:
 
@@ -169,13 +168,12 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
                 for extra in (fills.slack, fills.variance)
             )
-            compensated = _smooth(path.on_ground(ground.result()), config)
-            # How sure the path is, is another question.
-            if (fills.slack != fills.variance).any():
-                covariance = _covariance_of(*compensated, sure.on_ground(ground.result()))
-                compensated = eqx.tree_at(lambda s: s[0].covariance, compensated, covariance)
-        standard, floor = ignoring.result()
-        smoothed, floor = compensated or (standard, floor)
+            compensated = _path(path.on_ground(ground.result()), config)
+        standard = ignoring.result()
+        found = compensated or standard
+        # How sure the path is, is another question.
+        sure = with_rests_in_doubt(sure, config)
+        covariance = _covariance(found, sure.on_ground(ground.result()))
     clock.lap("smoother")
 
     n = len(recording)
@@ -185,6 +183,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         return *named, *jax.tree.leaves(f.heard)
 
     fills = eqx.tree_at(sampled, fills, [x[:n] for x in sampled(fills)])
+    floor = found.floor
     if floor is not None:
         floor = eqx.tree_at(lambda f: f.active, floor, floor.active[:n])
     offsets = np.concatenate([prepared.gyr_offset, np.zeros(3)])
@@ -195,10 +194,10 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         config=config,
         trajectory=Trajectory(
             time=recording.time,
-            q_nb=np.asarray(smoothed.state.q_nb)[:n],
-            position=np.asarray(smoothed.state.position)[:n],
-            velocity=np.asarray(smoothed.state.velocity)[:n],
-            covariance=np.asarray(smoothed.covariance)[:n],
+            q_nb=np.asarray(found.state.q_nb)[:n],
+            position=np.asarray(found.state.position)[:n],
+            velocity=np.asarray(found.state.velocity)[:n],
+            covariance=np.asarray(covariance)[:n],
         ),
         problem=sure,
         rails=prepared.rails,
@@ -211,7 +210,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         fills=fills,
         calibration=jax.tree.map(np.asarray, calibration),
         standard_position=np.asarray(standard.state.position)[:n],
-        cost=np.asarray(smoothed.cost),
+        cost=np.asarray(found.cost),
         cost_standard=np.asarray(standard.cost),
         gravity=float(trial.gravity),
         level=config.height.mode == "auto" and ground.result() is not None,
@@ -270,8 +269,19 @@ class _Clock:
         self._last = now
 
 
-def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:
-    smoothed, floor = _whole_trial(
+class Path(NamedTuple):
+    """What the smoother says of a whole trial, but for how sure it is."""
+
+    state: NavState
+    """N+1 of them."""
+    cost: Float[Array, ""]
+    """J*."""
+    floor: ActiveSet | None
+    """Of `height.mode = "nonnegative"`."""
+
+
+def _path(trial: Trial, config: Config) -> Path:
+    found = _whole_trial(
         trial.signal,
         trial.period,
         trial.variance,
@@ -282,12 +292,12 @@ def _smooth(trial: Trial, config: Config) -> tuple[Smoothed, ActiveSet | None]:
         np.asarray(config.smoother.relinearisations),
         config.height.mode == "nonnegative",
     )
-    return jax.block_until_ready(smoothed), floor
+    return jax.block_until_ready(found)
 
 
-def _covariance_of(path: Smoothed, floor: ActiveSet | None, trial: Trial) -> Float[Array, "N 9 9"]:
+def _covariance(path: Path, trial: Trial) -> Float[Array, "N1 9 9"]:
     """Of a path by the noise of `trial`; rests that touch the floor still do."""
-    touching = None if floor is None else floor.active
+    touching = None if path.floor is None else path.floor.active
     given = path.state, trial.signal, trial.period, trial.variance, trial.rows, touching
     return jax.block_until_ready(_about(*given, trial.prior, trial.prior_covariance, trial.gravity))
 
@@ -306,4 +316,6 @@ def _whole_trial(
     signal, period, variance, rows, prior, prior_covariance, gravity, relinearisations, nonnegative: bool
 ):
     problem = (Samples(signal, period, variance), rows, prior, prior_covariance, gravity, relinearisations)
-    return smooth_nonnegative(*problem) if nonnegative else (smooth(*problem), None)
+    smoothed, floor = smooth_nonnegative(*problem) if nonnegative else (smooth(*problem), None)
+    # Covariances that nobody asks for are not computed.
+    return Path(smoothed.state, smoothed.cost, floor)

@@ -21,7 +21,7 @@ from jaxsat.saturation.level_ground import ROW, is_level
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording, sensor_changes
-from jaxsat.signals.rests import Segments, find_rests, find_segments, resting_rate
+from jaxsat.signals.rests import Segments, find_rests, find_segments, resting_rate, runs
 from jaxsat.signals.support import find_support
 
 # Up to so long before its first rest (s) a recording's tilt is as well known as in it.
@@ -116,6 +116,22 @@ def find_ground(
         return grounded
     known = calibrate_by_rests(trial, config) if calibration is None else calibration
     return grounded if is_level(trial.calibrated(known), grounded) else None
+
+
+def with_rests_in_doubt(trial: Trial, config: Config) -> Trial:
+    """With the variance of resting velocities that claims of sd rest on; the path takes them as white.
+
+    A foot that is taken to rest creeps on: its velocity is alike for `noise.rest_steady` (a rest tells it once, not
+    once a sample), and the point that stands still wanders from heel to toe by `smoother.lever_sd`.
+    """
+    rest = np.asarray(trial.rows.rest)
+    starts, ends = runs(rest)
+    alike = np.minimum(ends - starts, config.noise.rest_steady / trial.period[0])
+    times = np.ones(len(rest))
+    times[rest] = np.repeat(np.maximum(alike, 1.0), ends - starts)
+    turning = np.sum(np.asarray(trial.signal)[:, :3] ** 2, axis=1)
+    variance = (np.asarray(trial.rows.velocity_variance) + config.smoother.lever_sd**2 * turning) * times
+    return eqx.tree_at(lambda t: t.rows.velocity_variance, trial, variance)
 
 
 def _trial(

@@ -32,7 +32,7 @@ from peers.gaitmap_rts import rts_kalman
 
 from jaxsat.config import load_config
 from jaxsat.errors import InputError
-from jaxsat.pipeline import estimate
+from jaxsat.pipeline import Estimate, estimate
 from jaxsat.preparation import prepare
 from jaxsat.signals.readers import read
 from jaxsat.signals.recording import Recording
@@ -226,22 +226,33 @@ PARTS = {
 
 
 def intervals(data: Path) -> pd.DataFrame:
-    """Walks clipped in software, by `map`: what each interval should have held is known."""
-    recordings = {
-        name: (read(data / "pyshoe" / f"{name}.mat", rest_column="zv_shoe_opt"), 250)
-        for name in tomllib.loads((data / "pyshoe" / "splits.toml").read_text())["clip"]
-    }
+    """Of `map`: on walks clipped in software, where what each should have held is known, and strides by Vicon."""
+    folder, scores = data / "pyshoe", []
+    splits = tomllib.loads((folder / "splits.toml").read_text())
+    walks = {name: (read(folder / f"{name}.mat", rest_column="zv_shoe_opt"), 250) for name in splits["clip"]}
+    others = {}
     for side in ("left", "right"):
         walk = read(data / "gaitmap" / "imu_sample_not_rotated.csv", sensor=f"{side}_sensor")
-        recordings[f"gaitmap {side}"] = walk, 300
-    recordings["xio"] = read(data / "xio" / "short_walk.csv"), 400
-    recordings["openshoe 44"] = read(data / "openshoe" / "Measurement_100521_44.npz"), 350
-    scores = []
-    for name, (recording, rail) in recordings.items():
+        others[f"gaitmap {side}"] = walk, 300
+    others["xio"] = read(data / "xio" / "short_walk.csv"), 400
+    others["openshoe 44"] = read(data / "openshoe" / "Measurement_100521_44.npz"), 350
+    for name, (recording, rail) in (walks | others).items():
         found = estimate(clip(recording, gyr=rail), load_config(None, method="map"))
         scores += accuracy_intervals.held(f"{name}, {rail} °/s", recording, found)
+        if name in walks:
+            scores += strides(folder, name, f"{name}, {rail} °/s", found)
         print("intervals", name, flush=True)
+    for name in splits["saturated"]:
+        recording = read(folder / f"{name}.mat", rest_column="zv_shoe_opt")
+        scores += strides(
+            folder, name, name, estimate(recording, load_config(None, method="map")), "saturated "
+        )
     return accuracy_intervals.summary(pd.DataFrame(scores))
+
+
+def strides(folder: Path, name: str, label: str, found: Estimate, which: str = "") -> Iterator[dict]:
+    _, truth = load_pyshoe_truth(folder / f"{name}.mat", at=found.recording.time)
+    return accuracy_intervals.strides_held(label, found, truth, pyshoe_point(folder, name), which)
 
 
 def merged(before: pd.DataFrame, table: pd.DataFrame, parts: list[str], methods: list[str]) -> pd.DataFrame:

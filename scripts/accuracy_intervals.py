@@ -1,18 +1,31 @@
-"""How often the intervals of `map` hold what real recordings clipped in software lost."""
+"""How often the intervals of `map` hold what real recordings clipped in software lost, and the strides of Vicon."""
 
 from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from scipy.stats import norm
 
 from jaxsat.pipeline import Estimate
-from jaxsat.present.tables import gaps_table
+from jaxsat.present.tables import gaps_table, segments_table
 from jaxsat.signals.recording import CHANNELS, Recording
 from jaxsat.studies.boards import Row
+from jaxsat.studies.metrics import align_yaw_translation
+from jaxsat.studies.tracked_point import TrackedPoint
 
 GOALS = {0.5: (0.45, 0.55), 0.9: (0.85, 0.95)}
-WHAT = {"samples": "filled samples", "peaks": "peaks of gaps", "impulses": "impulses of gaps"}
+WHAT = {
+    "samples": "filled samples",
+    "peaks": "peaks of gaps",
+    "impulses": "impulses of gaps",
+    "lengths": "lengths of clipped strides",
+    "climbs": "climbs of clipped strides",
+    "saturated lengths": "lengths of strides of saturated trials",
+    "saturated climbs": "climbs of strides of saturated trials",
+}
+# Shorter ways are no strides, and cameras lose a foot whose stride they see that much longer or shorter (m).
+STRIDE, LOST = 0.5, 0.3
 
 
 def held(name: str, recording: Recording, found: Estimate) -> Iterator[dict]:
@@ -37,6 +50,29 @@ def held(name: str, recording: Recording, found: Estimate) -> Iterator[dict]:
         yield {**one, "what": "impulses", "z": (gap["impulse"] - impulse) / gap["impulse_sd"]}
 
 
+def strides_held(
+    name: str, found: Estimate, truth: Float[np.ndarray, "N 3"], point: TrackedPoint, which: str = ""
+) -> Iterator[dict]:
+    """Of a PyShoe trial: errors over their sd of what each stride is long and climbs; truth (m): at its samples."""
+    time, path = found.recording.time, found.trajectory
+    tracked = point.path(time, path.position, path.q_nb)
+    late = TrackedPoint(np.zeros(3), point.lag).path(time, path.position, path.q_nb)
+    # Where the sensor was, in the frame of the estimate.
+    sensor = align_yaw_translation(truth, tracked) - (tracked - late)
+    strides = segments_table(found).dropna(subset=["length_sd", "climb_sd"])
+    ends = strides[["start", "end"]].to_numpy() + point.lag - [found.recording.period, 0.0]
+    start, end = (np.stack([np.interp(at, time, x) for x in sensor.T], axis=1) for at in ends.T)
+    way = end - start
+    errors = {
+        "lengths": strides["length"].to_numpy() - np.hypot(*way[:, :2].T),
+        "climbs": strides["climb"].to_numpy() - way[:, 2],
+    }
+    seen = (strides["length"].to_numpy() > STRIDE) & (np.abs([*errors.values()]).max(axis=0) < LOST)
+    for what, error in errors.items():
+        for z in (error / strides[f"{what[:-1]}_sd"].to_numpy())[seen]:
+            yield {"trial": name, "sensor": "path", "what": f"{which}{what}", "z": float(z)}
+
+
 def summary(scores: pd.DataFrame) -> pd.DataFrame:
     """Share of |z| within the central 50 % and 90 % of a Gaussian, by trial and sensor, and how many there were."""
     groups = scores.groupby(["trial", "sensor", "what"], sort=False)["z"]
@@ -57,8 +93,9 @@ def board(table: pd.DataFrame) -> Iterator[Row]:
             column = f"within_{share * 100:.0f}"
             value = float(np.average(rows[column], weights=rows["count"]))
             by_trial = [float(np.mean(part[column])) for _, part in rows.groupby("trial")]
+            metric = f"interval_{share * 100:.0f}_{what.replace(' ', '_')}"
             yield Row(
-                f"interval_{share * 100:.0f}_{what}", abs(value - share), "1", "lower", high - share, None,
+                metric, abs(value - share), "1", "lower", high - share, None,
                 f"{value:.0%} of {rows['count'].sum()} {words} lie in their {share:.0%} intervals (goal {low:.0%} to "
                 f"{high:.0%}); trials {min(by_trial):.0%} to {max(by_trial):.0%}",
             )  # fmt: skip

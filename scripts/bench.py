@@ -42,10 +42,10 @@ from problems import (
 )
 
 from jaxsat import Sensor, load_config, simulate
-from jaxsat.inertial.programs import compiled
+from jaxsat.inertial.programs import compiled, computing
 from jaxsat.inertial.smoother import smooth_about
-from jaxsat.pipeline import _smooth, estimate
-from jaxsat.preparation import prepare
+from jaxsat.pipeline import _covariance, _path, estimate
+from jaxsat.preparation import find_ground, prepare
 from jaxsat.saturation.compensate import filter_trial
 from jaxsat.saturation.layout import gather
 from jaxsat.saturation.segment import condense, value_gradient_root
@@ -106,9 +106,10 @@ def estimate_vs_smoother() -> Iterator[Row]:
     recording = with_rests(recording, truth)
     config = load_config(None, method="direct")
     found = estimate(recording, config)
-    with jax.enable_x64(True):
-        trial = prepare(recording, config).trial
-        smoother = shortest(lambda: _smooth(trial, config)[0].cost)
+    with computing():
+        prepared = prepare(recording, config)
+        trial = prepared.trial.on_ground(find_ground(prepared, config))
+        smoother = shortest(lambda: _covariance(_path(trial, config), trial))
     seconds = shortest(lambda: estimate(recording, config).cost)
     plain = load_config(None, method="standard")
     standard = shortest(lambda: estimate(recording, plain).cost)

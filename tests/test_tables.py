@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxsat.config import Config
+from jaxsat.config import Config, load_config
 from jaxsat.errors import InputError
 from jaxsat.pipeline import estimate
 from jaxsat.present import folder as folder_module
@@ -23,6 +23,7 @@ from jaxsat.studies.motions import Bar
 from jaxsat.studies.simulate import Sensor, simulate
 
 AXES = "xyz"
+STILL = {"noise.rest_steady": 0.0, "smoother.lever_sd": 0.0}
 TRAJECTORY = [
     "time",
     *("q_w", "q_x", "q_y", "q_z"),
@@ -52,7 +53,8 @@ def simulated():
 
 @pytest.fixture(scope="module")
 def found(simulated):
-    return estimate(simulated[0], Config(method="direct"))
+    # It rests on the spot, and does not roll.
+    return estimate(simulated[0], load_config(None, method="direct", **STILL))
 
 
 @pytest.fixture(scope="module")
