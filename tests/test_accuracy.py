@@ -13,8 +13,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxsat import estimate, load_config, simulate
+from jaxsat.present.tables import segments_table
 from jaxsat.signals.recording import Recording
-from jaxsat.studies.motions import Bar
+from jaxsat.studies.motions import Bar, Walk
+from jaxsat.studies.tracked_point import TrackedPoint
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -105,7 +107,7 @@ def test_intervals_that_are_right_hold_their_share_and_others_do_not(board):
             z = rng.normal(size=4000) * (3.0 if what == "peaks" else scale)
             rows += [{"trial": name, "sensor": "gyr", "what": what, "z": value} for value in z]
     table = intervals.summary(pd.DataFrame(rows))
-    assert len(table) == 6 and (table["count"] == 4000).all()
+    assert len(table) == 2 * len(intervals.WHAT) and (table["count"] == 4000).all()
     found = {row.metric: row for row in intervals.board(table)}
     for what, right in (("samples", True), ("impulses", True), ("peaks", False)):
         for share in (50, 90):
@@ -137,6 +139,30 @@ def test_what_a_gap_lost_is_compared_with_the_recording_before_it_was_clipped(bo
     top = np.argmax(np.abs(filled))
     peak = (filled[top] - true[np.argmax(np.abs(true))]) / found.signal_sd[i + top, 1]
     assert rows.loc["peaks", "z"] == pytest.approx(peak) and len(rows) == j - i + 2
+
+
+def test_a_stride_is_compared_with_that_of_the_sensor_not_of_the_marker(board):
+    """Cameras that see a marker, in a frame of their own, walk 5 % further and climb 1 cm a stride more."""
+    intervals = importlib.import_module("accuracy_intervals")
+    motion = Walk(strides=5)
+    recording, made = simulate(
+        motion, rate=100.0, duration=float(motion.moving[-1, 1]) + 1.0, key=jax.random.key(1)
+    )
+    found = estimate(dataclasses.replace(recording, rest=made.rest), load_config(None, method="standard"))
+    path, point = found.trajectory, TrackedPoint(np.array([0.02, 0.0, 0.08]), 0.0)
+    strides = segments_table(found).dropna(subset=["length_sd"])
+    lengths = strides["length"].to_numpy()
+    times, steps = strides[["start", "end"]].to_numpy().ravel(), np.arange(2 * len(strides)) + 1
+    climbing = 0.01 * np.interp(path.time, times, steps // 2)
+    sensor = path.position * [1.05, 1.05, 1.0] + np.stack([0 * climbing, 0 * climbing, climbing], axis=1)
+    marker = sensor + point.path(path.time, path.position, path.q_nb) - path.position
+    turned = Rotation.from_euler("z", 1.0).apply(marker) + np.array([5.0, 1.0, 2.0])
+    rows = pd.DataFrame(intervals.strides_held("walk", found, turned, point)).set_index("what")
+    away = rows.loc["lengths", "z"].to_numpy() * strides["length_sd"].to_numpy()
+    assert len(away) == 5
+    np.testing.assert_allclose(away, -0.05 * lengths, atol=2e-3)
+    climbs = rows.loc["climbs", "z"].to_numpy() * strides["climb_sd"].to_numpy()
+    np.testing.assert_allclose(climbs, -0.01, atol=1e-3)
 
 
 @pytest.mark.parametrize("vertical", [True, False])
