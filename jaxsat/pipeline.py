@@ -23,7 +23,14 @@ from jaxsat.inertial.smoother import (
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.preparation import calibrate_by_rests, constants_sd, find_ground, prepare, with_rests_in_doubt
+from jaxsat.preparation import (
+    calibrate_by_rests,
+    calibration_in_doubt,
+    constants_sd,
+    find_ground,
+    prepare,
+    with_rests_in_doubt,
+)
 from jaxsat.saturation.compensate import (
     Fills,
     compensate_parallel,
@@ -147,7 +154,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         sure = trial.calibrated(calibration)
         ground = beside.submit(find_ground, prepared, config, calibration)
         ignoring = beside.submit(lambda trial: _path(trial.on_ground(ground.result()), config), sure)
-        compensated = None
+        compensated, taken = None, (trial.signal, trial.unfilled_variance)
         if options is not None and learning is not None:
 
             def learned(prior=learning):
@@ -163,17 +170,20 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
             else:
                 fills, calibration = compensate_sequential(*given, report)
             clock.lap("compensation")
+            taken = fills.signal, fills.variance
             filled = eqx.tree_at(lambda t: t.signal, trial, fills.signal).calibrated(calibration)
             path, sure = (
                 eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
                 for extra in (fills.slack, fills.variance)
             )
             compensated = _path(path.on_ground(ground.result()), config)
+        doubted = beside.submit(calibration_in_doubt, trial, config, calibration, *taken)
         standard = ignoring.result()
         found = compensated or standard
         # How sure the path is, is another question.
         sure = with_rests_in_doubt(sure, config)
         covariance = _covariance(found, sure.on_ground(ground.result()))
+        calibration = doubted.result()
     clock.lap("smoother")
 
     n = len(recording)

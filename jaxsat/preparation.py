@@ -16,7 +16,7 @@ from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
 from jaxsat.saturation.compensate import FIRST_STEPS, calibrate_recording, filter_recording
 from jaxsat.saturation.false_rests import false_rests
-from jaxsat.saturation.layout import Trial, pad
+from jaxsat.saturation.layout import Arrays, Trial, pad
 from jaxsat.saturation.level_ground import ROW, is_level
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
@@ -101,6 +101,24 @@ def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
     for _ in range(FIRST_STEPS if sd is not None else 0):
         found = calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, found)
     return found
+
+
+def calibration_in_doubt(
+    trial: Trial,
+    config: Config,
+    found: Calibration,
+    signal: Float[Arrays, "P 6"],
+    extra: Float[Arrays, "P 6"],
+) -> Calibration:
+    """The same constants with the sd that `with_rests_in_doubt` leaves.
+
+    signal, extra: what they were found from, as for `calibrate_recording`.
+    """
+    sd = constants_sd(config)
+    if sd is None:
+        return found
+    doubted = calibrate_recording(with_rests_in_doubt(trial, config), signal, extra, sd, found)
+    return Calibration(found.constants, doubted.sd)
 
 
 def find_ground(
