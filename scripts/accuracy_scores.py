@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from jaxsat.studies.boards import Row
+from jaxsat.studies.boards import Direction, Row
 from jaxsat.studies.metrics import geometric_mean_ratio
 
 TRIALS = "12 saturated trials"
@@ -27,7 +27,7 @@ def board(table: pd.DataFrame, parts: list[str], every: tuple[str, ...]) -> Iter
         there = set(table.loc[(table["part"] == part) & (table["kind"] == kind), "method"])
         return [method for method in every if method in there]
 
-    def row(metric, value, unit, goal, note, better="lower") -> Row:
+    def row(metric, value, unit, goal, note, better: Direction = "lower") -> Row:
         goal = goal if metric.endswith("_map") and "tracked" not in metric else None
         return Row(metric, float(value), unit, better, goal, None, note)
 
