@@ -14,13 +14,12 @@ from jaxsat.config import load_config
 from jaxsat.errors import InputError
 from jaxsat.inertial.programs import keep_traces
 from jaxsat.pipeline import Estimate, estimate
-from jaxsat.preparation import LATEST_FIRST_REST, prepare, with_rests_in_doubt
+from jaxsat.preparation import LATEST_FIRST_REST
 from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table
 from jaxsat.saturation import compensate
 from jaxsat.saturation.compensate import ENTRIES, LANES, signal_prior, solved_together
 from jaxsat.signals.readers import read
-from jaxsat.signals.rests import runs
 from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
 from jaxsat.studies.motions import Bar, Walk
 from jaxsat.studies.simulate import Sensor, simulate
@@ -261,35 +260,6 @@ def test_covariance_grows_in_motion_and_is_small_at_rest():
     assert speed_sd[~truth.rest].max() > 1.5 * np.median(speed_sd[truth.rest])
     eigenvalues = np.linalg.eigvalsh(found.trajectory.covariance[:: len(truth.rest) // 20])
     assert eigenvalues.min() > -1e-12
-
-
-def test_a_foot_that_creeps_makes_claims_wider_and_no_path_different():
-    recording, _ = walk(4)
-    white, steady = (
-        estimate(recording, load_config(None, method="standard", **{"noise.rest_steady": x})).trajectory
-        for x in (0.0, 0.5)
-    )
-    np.testing.assert_array_equal(steady.position, white.position)
-    np.testing.assert_array_equal(steady.q_nb, white.q_nb)
-    wider = np.sqrt(steady.covariance[-1, 3, 3] / white.covariance[-1, 3, 3])
-    # A rest of n samples tells a velocity once, not n times.
-    samples = recording.rest.sum() / np.sum(np.diff(recording.rest.astype(int)) == 1)
-    assert 2.0 < wider < np.sqrt(samples)
-
-
-def test_a_rest_counts_once_in_each_time_that_its_velocity_stays_alike():
-    recording, _ = walk(4)
-    config = load_config(None, **{"noise.rest_steady": 0.2, "smoother.lever_sd": 0.1})
-    trial = prepare(recording, config).trial
-    rest = np.asarray(trial.rows.rest)
-    doubted = np.asarray(with_rests_in_doubt(trial, config).rows.velocity_variance)
-    turning = np.sum(trial.signal[:, :3] ** 2, axis=1)
-    starts, ends = runs(rest)
-    assert len(starts) > 3 and np.ptp(ends - starts) > 0
-    for start, end in zip(starts, ends, strict=True):
-        times = min(end - start, 0.2 / recording.period)
-        expected = times * (0.02**2 + 0.1**2 * turning[start:end])
-        np.testing.assert_allclose(doubted[start:end], expected, rtol=1e-12)
 
 
 def test_missing_samples_carry_no_weight_and_one_sentence_says_so():
