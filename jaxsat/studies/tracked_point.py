@@ -6,15 +6,12 @@ where the truth was measured: the lever between them is found from the swings th
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxsat.errors import InputError
-from jaxsat.inertial.rotations import quat_rotate
 
 Positions = Float[np.ndarray, "N 3"]
 
@@ -40,9 +37,8 @@ class TrackedPoint(NamedTuple):
         self, time: Float[np.ndarray, "N"], position: Positions, q_nb: Float[np.ndarray, "N 4"]
     ) -> Positions:
         """Of that point by an estimate of the sensor's path, as the truth's time stamps have it (m)."""
-        point = position + np.asarray(
-            jax.vmap(quat_rotate, (0, None))(jnp.asarray(q_nb), jnp.asarray(self.lever))
-        )
+        # SciPy's quaternions have w last.
+        point = position + Rotation.from_quat(np.roll(q_nb, -1, axis=1)).apply(self.lever)
         return np.stack([np.interp(time - self.lag, time, axis) for axis in point.T], axis=1)
 
 

@@ -184,8 +184,9 @@ def _against(made: NoiseTrial, recording: Recording, truth: Track, config: Confi
         return np.stack([np.interp(at, time, axis) for axis in track.T], axis=1)
 
     noise = config.noise
-    start = jnp.asarray([noise.gyr_density, noise.acc_density, noise.rest_velocity_sd], float)
-    state = jax.tree.map(lambda x: np.asarray(x)[: len(own)][scored], jax.jit(_path)(made, start))
+    with computing():
+        start = jnp.asarray([noise.gyr_density, noise.acc_density, noise.rest_velocity_sd], float)
+        state = jax.tree.map(lambda x: np.asarray(x)[: len(own)][scored], jax.jit(_path)(made, start))
     point = find_tracked_point(own[scored], state.position, state.q_nb, reference(own[scored]))
     size = len(made.scored)
     changed = pad(reference(own + point.lag), size), pad(scored, size), point.lever
