@@ -40,17 +40,17 @@ def board(table: pd.DataFrame, parts: list[str], every: tuple[str, ...]) -> Iter
                         mine, theirs = (
                             of("pyshoe", kind, m, f"{column}_{axes}") for m in (method, "standard")
                         )
-                        ratio, note = (
-                            geometric_mean_ratio(mine, theirs),
-                            "geometric mean of the ratio to standard",
-                        )
-                        yield row(
-                            f"pyshoe_{point}ratio_{axes}_{name}{method}", ratio, "1", 0.70, f"{what}: {note}"
-                        )
-                        worst, note = (mine / theirs).max(), "worst of these ratios"
-                        yield row(
-                            f"pyshoe_{point}worst_{axes}_{name}{method}", worst, "1", 1.02, f"{what}: {note}"
-                        )
+                        of_both = {
+                            "ratio": (
+                                geometric_mean_ratio(mine, theirs),
+                                0.70,
+                                "geometric mean of the ratio to standard",
+                            ),
+                            "worst": ((mine / theirs).max(), 1.02, "worst of these ratios"),
+                        }
+                        for score, (value, goal, note) in of_both.items():
+                            metric = f"pyshoe_{point}{score}_{axes}_{name}{method}"
+                            yield row(metric, value, "1", goal, f"{what}: {note}")
             for method in methods("pyshoe", "saturated"):
                 mean = of("pyshoe", "saturated", method, f"{column}_3d").mean()
                 yield row(f"pyshoe_{point}mean_3d_{method}", mean, "m", None, f"{TRIALS}{where}: mean RMSE")

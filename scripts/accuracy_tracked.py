@@ -28,7 +28,7 @@ def point_of(
 
 @cache
 def pyshoe_point(folder: Path, name: str) -> TrackedPoint:
-    """Of a trial by itself; of one that saturates by the list `clip`, whose sensor is mounted alike."""
+    """Of a trial by itself; of one that saturates by the list `clip`, mounted alike but for December's trials."""
     splits = tomllib.loads((folder / "splits.toml").read_text())
     if name in splits["saturated"]:
         points = [pyshoe_point(folder, other) for other in splits["clip"]]
