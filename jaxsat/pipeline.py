@@ -139,7 +139,6 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     prepared = prepare(recording, config)
     trial, segments, gaps = prepared.trial, prepared.segments, prepared.gaps
     clock.lap("signals")
-    fills = Fills.nothing(trial, len(segments))
     together = config.saturation.segments == "parallel"
     options = None
     if config.method != "standard" and len(gaps):
@@ -177,6 +176,8 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 for extra in (fills.slack, fills.variance)
             )
             compensated = _path(path.on_ground(ground.result()), config)
+        else:
+            fills = Fills.nothing(trial, len(segments))
         doubted = beside.submit(calibration_in_doubt, trial, config, calibration, *taken)
         standard = ignoring.result()
         found = compensated or standard

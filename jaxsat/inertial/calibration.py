@@ -50,10 +50,18 @@ class Calibration(eqx.Module):
 
     def applied(self, samples: Samples, rows: Rows) -> tuple[Samples, Rows]:
         """Samples without the biases, and rests about the point that stands still."""
-        signal = samples.signal - self.constants[None, :6]
-        velocity = jnp.cross(self.constants[None, 6:], signal[:, :3])
+        signal, velocity = corrected(samples.signal, self.constants)
         rows = eqx.tree_at(lambda r: r.velocity, rows, velocity, is_leaf=lambda x: x is None)
         return Samples(signal, samples.period, samples.variance), rows
+
+
+@jax.jit
+def corrected(
+    signal: Float[Array, "N 6"], constants: Float[Array, "9"]
+) -> tuple[Float[Array, "N 6"], Float[Array, "N 3"]]:
+    """Signals without the biases (rad/s, m/s²), and the velocity of a resting sensor in the body frame (m/s)."""
+    signal = signal - constants[None, :6]
+    return signal, jnp.cross(constants[None, 6:], signal[:, :3])
 
 
 def constants_quadratic(

@@ -8,11 +8,12 @@ import hashlib
 import os
 import pickle
 import platform
+import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import cache, partial, wraps
+from functools import cache, lru_cache, partial, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -21,7 +22,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 F = TypeVar("F", bound=Callable[..., Any])
 Options = dict[str, Any]
@@ -38,7 +39,7 @@ UNOPTIMISED: Options = {**OPTIONS, "xla_backend_optimization_level": 0}
 MOST_MAPS = 0.5
 
 _folder: Path | None = None
-_loaded: dict[str, "_Program | None"] = {}
+_loaded: dict[Hashable, "_Program | None"] = {}
 
 
 @contextmanager
@@ -48,8 +49,14 @@ def computing() -> Iterator[None]:
     Matrices of these problems are small: several threads gain nothing, and where another process wants the cores too
     they wait for each other twenty times as long as they compute.
     """
-    with threadpool_limits(1, "blas"), jax.enable_x64(True):
+    with _libraries(len(sys.modules)).limit(limits=1, user_api="blas"), jax.enable_x64(True):
         yield
+
+
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Of linear algebra, as loaded. To look for them takes a millisecond, and more come with modules only."""
+    return ThreadpoolController()
 
 
 class Beside(ThreadPoolExecutor):
@@ -127,10 +134,13 @@ def stored_jit(function: F, options: Options | None = OPTIONS) -> F:
         kinds = [jax.typeof(leaf) for leaf in leaves]
         name = f"{function.__module__}.{function.__qualname__}"
         where = _platform()
-        parts = name, _surroundings(), where, jax.config.jax_enable_x64, structure, rest, kinds  # type: ignore[attr-defined]
-        key = hashlib.sha256(repr(parts).encode()).hexdigest()
+        settings = name, where, jax.config.jax_enable_x64  # type: ignore[attr-defined]
+        plain, form = jax.tree.flatten(rest, is_leaf=lambda x: x is None)
+        # To print all of it takes a millisecond, to look it up a tenth of one.
+        key = *settings, structure, form, *((type(x), x) for x in plain), *kinds
         if key not in _loaded:
-            path = folder / f"{key}.trace"
+            parts = *settings, _surroundings(), structure, rest, kinds
+            path = folder / f"{hashlib.sha256(repr(parts).encode()).hexdigest()}.trace"
 
             def whole(*given):
                 return function(*eqx.combine(jax.tree.unflatten(structure, given), rest))

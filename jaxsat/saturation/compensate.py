@@ -239,8 +239,8 @@ def trace_search(
     size, prior = filtered_size(trial.rows), None
     if options.method == "map":
         prior = blank(len(trial.period), options.scales)
-    here, counts = trial.calibrated(Calibration.none()), count_values(trial.sign, segments)
-    programs = {}
+    counts, programs, still = count_values(trial.sign, segments), {}, trial.signal[:, :3]
+    here = eqx.tree_at(lambda t: t.rows.velocity, trial, still, is_leaf=lambda x: x is None)
     for mine, sizes in solved_together(*counts) if together else [_one_by_one(*counts)]:
         lanes = _lanes(len(mine)) if together else 1
         lane = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)

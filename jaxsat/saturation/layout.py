@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsat.inertial.calibration import Calibration
+from jaxsat.inertial.calibration import Calibration, corrected
 from jaxsat.inertial.smoother import Rows
-from jaxsat.inertial.strapdown import NavState, Samples
+from jaxsat.inertial.strapdown import NavState
 from jaxsat.saturation.gap_shapes import Edges, edge_slope, gap_ends
 from jaxsat.saturation.prior import SignalPrior, of_values
 from jaxsat.saturation.segment import Segment
@@ -46,13 +46,13 @@ class Trial(eqx.Module):
     @property
     def unfilled_variance(self) -> Float[Arrays, "N 6"]:
         """Of a saturated value while δ is 0: the second moment about that end of what its bounds leave."""
-        return jnp.where(jnp.asarray(self.sign) != 0, jnp.asarray(self.bound**2 / 3.0)[None], 0.0)
+        numbers = np if isinstance(self.sign, np.ndarray) else jnp
+        return numbers.where(self.sign != 0, self.bound[None] ** 2 / 3.0, 0.0)
 
     def calibrated(self, calibration: Calibration) -> "Trial":
         """Without the biases, and resting about the point that stands still."""
-        arrays = map(jnp.asarray, (self.signal, self.period, self.variance))
-        samples, rows = calibration.applied(Samples(*arrays), self.rows)
-        return eqx.tree_at(lambda t: (t.signal, t.rows), self, (samples.signal, rows))
+        found = corrected(*map(jnp.asarray, (self.signal, calibration.constants)))
+        return eqx.tree_at(lambda t: (t.signal, t.rows.velocity), self, found, is_leaf=lambda x: x is None)
 
     def padded(self) -> "Trial":
         """With blank samples behind the end, to a length that recordings of about the same length share."""

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +19,8 @@ STILL_WINDOW = 0.15
 """Length of the windows whose stillness is judged (s): half of a short stance."""
 TILT = np.deg2rad(2.0)
 """A sensor that turns by less than this over `START` is called at rest (rad)."""
+COARSE = 0.02
+"""Turns within so long are added up before units are compared (s): which fits twice as well shows all the same."""
 UNIT_SCALES = {"deg/s": np.pi / 180, "rad/s": 180 / np.pi}
 RATE_SCALES = 2.0 ** np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
 
@@ -180,16 +182,20 @@ def spurious_accelerations(
     specific force and sampling period fit together. The median of its size over all moves; None without any.
     A wrong scale tilts gravity into it: `scales` compare units, and rates too, as an angle is rate × period.
     """
-    n = max(3, round(STILL_WINDOW / recording.period))
+    size = max(1, int(COARSE / recording.period))
+    still = _blocks(still, size).all(axis=1)
+    turns = _blocks(recording.gyr * recording.period, size).sum(axis=1)
+    acc = _blocks(recording.acc, size).mean(axis=1)
+    n = max(3, round(STILL_WINDOW / (recording.period * size)))
     starts, ends = runs(still)
     long = ends - starts >= n
     leave, arrive = ends[long][:-1] - n // 2, starts[long][1:] + n // 2
     if not len(leave):
         return None
-    acc, calm = recording.acc, uniform_filter1d(recording.acc, n, axis=0)[leave]
+    calm = uniform_filter1d(acc, n, axis=0)[leave]
 
     def some(scales):
-        attitude = attitudes(scales[:, None, None] * (recording.gyr * recording.period))
+        attitude = attitudes(scales[:, None, None] * turns)
         total = np.zeros((len(scales), len(acc) + 1, 3))
         np.cumsum(_rotated(attitude, acc), axis=1, out=total[:, 1:])
         mean = (total[:, arrive] - total[:, leave]) / (arrive - leave)[:, None]
@@ -198,6 +204,12 @@ def spurious_accelerations(
     # As many at once as a few MB hold.
     parts = -(-len(scales) * len(acc) // 2**15)
     return np.concatenate([some(part) for part in np.array_split(scales, min(parts, len(scales)))])
+
+
+def _blocks(x: Shaped[np.ndarray, "N *k"], size: int) -> Shaped[np.ndarray, "B size *k"]:
+    """So many samples side by side; what does not fill a block is left out."""
+    count = len(x) // size
+    return x[: count * size].reshape(count, size, *x.shape[1:])
 
 
 def attitudes(turns: Float[np.ndarray, "S N 3"]) -> Float[np.ndarray, "S N 4"]:

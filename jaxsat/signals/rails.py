@@ -4,7 +4,7 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxsat.errors import InputError
 from jaxsat.signals.recording import Recording
@@ -54,10 +54,12 @@ def find_rails(recording: Recording, gyr: RailSetting = "auto", acc: RailSetting
     """
     signal = recording.signal
     usable = ~recording.missing
-    edge = np.full((2, 6), np.inf)
+    score, edge = np.full((2, 2, 6), np.inf)
+    asked = [j for j in range(6) if (gyr if j < 3 else acc) == "auto"]
+    score[:, asked], edge[:, asked] = _cut_off([signal[usable[:, j], j] for j in asked])
     for sensor, setting in ((slice(0, 3), gyr), (slice(3, 6), acc)):
         if setting == "auto":
-            edge[:, sensor] = _sensor_rails(signal[:, sensor], usable[:, sensor])
+            edge[:, sensor] = _sure(score[:, sensor], edge[:, sensor])
         elif setting != "none":
             if not float(setting) > 0:
                 raise InputError(
@@ -71,10 +73,8 @@ def find_rails(recording: Recording, gyr: RailSetting = "auto", acc: RailSetting
     )
 
 
-def _sensor_rails(signal: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Plateau edges of the three axes of one sensor, downwards and upwards (2, 3)."""
-    found = np.array([_channel_rails(signal[usable[:, j], j]) for j in range(3)])
-    score, edge = found[..., 0].T, found[..., 1].T
+def _sure(score: Float[np.ndarray, "2 3"], edge: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:
+    """Plateau edges of the axes of one sensor, infinite where they may be none."""
     sure = (score >= EVIDENCE) & np.isfinite(edge)
     # The axes of a sensor share one full scale: beside a sure rail, being likelier than not is enough.
     if sure.any():
@@ -83,63 +83,102 @@ def _sensor_rails(signal: np.ndarray, usable: np.ndarray) -> np.ndarray:
     return np.where(sure, edge, np.inf)
 
 
-def _channel_rails(x: Float[np.ndarray, "N"]) -> list[tuple[float, float]]:
-    """Of one channel, downwards and upwards: log-odds that its peaks were cut off, and where their plateau begins."""
-    if len(x) < 7 or x.max() == x.min():
-        return [(-np.inf, np.inf)] * 2
-    noise, quantum = _noise(x), _quantum(x)
-    return [_upper_rail(sign * x, noise, quantum) for sign in (-1, 1)]
+def _cut_off(channels: list[Float[np.ndarray, "_"]]) -> Float[np.ndarray, "2 2 C"]:
+    """Log-odds that the highest peaks of each were cut off, downwards and upwards, and where their plateaus begin."""
+    score, edge = np.full(2 * len(channels), -np.inf), np.full(2 * len(channels), np.inf)
+    sides = _Sides(channels)
+    if sides.count:
+        tops = [_Tops(sides, depth) for depth in DEPTHS]
+        scores = np.stack([t.flatness() + t.pairing() + t.levelling() for t in tops])
+        best = scores.argmax(axis=0)
+        highest, edges = scores.max(axis=0), np.full(sides.count, np.inf)
+        for k, here in enumerate(tops):
+            # Below the best depth, further plateaus count if they are flat by themselves.
+            further = here.edge(below=sides.top - tops[k - 1].depth) if k else edges
+            edges = np.minimum(edges, np.where(best == k, here.edge(), np.where(best < k, further, np.inf)))
+        # A smeared plateau has next to no equal samples; where equality alone explains it, the rail is sharp.
+        score[sides.which] = highest
+        edge[sides.which] = np.where(scores[0] >= highest / 2, sides.top, edges)
+    return np.stack([score, edge]).reshape(2, 2, len(channels))
 
 
-def _upper_rail(x: np.ndarray, noise: float, quantum: float) -> tuple[float, float]:
-    top = x.max()
-    if top <= 0:
-        return -np.inf, np.inf
-    peaks = _peaks(x)
-    tops = [_Tops(x, depth * top, noise, quantum, peaks) for depth in DEPTHS]
-    scores = [t.flatness() + t.pairing() + t.levelling() for t in tops]
-    best = int(np.argmax(scores))
-    # A smeared plateau has next to no equal samples; where equality alone explains it, the rail is sharp.
-    if scores[0] >= scores[best] / 2:
-        return scores[best], float(top)
-    # Below the best depth, further plateaus count if they are flat by themselves.
-    edges = [tops[best].edge()]
-    for before, deeper in zip(tops[best:], tops[best + 1 :], strict=False):
-        edges.append(deeper.edge(below=top - before.depth))
-    return scores[best], min(edges)
+class _Sides:
+    """Channels downwards and upwards, one behind the other: what is asked of each is asked of all at once."""
+
+    def __init__(self, channels: list[Float[np.ndarray, "_"]]):
+        moving = {j: x for j, x in enumerate(channels) if len(x) >= 7 and np.ptp(x) > 0}
+        known = {j: (_noise(x), _quantum(x)) for j, x in moving.items()}
+        # Those that can have a rail at all, by their place among all.
+        sides = {(i, j): sign * x for i, sign in enumerate((-1, 1)) for j, x in moving.items()}
+        sides = {place: x for place, x in sides.items() if x.max() > 0}
+        self.count, self.which = len(sides), [i * len(channels) + j for i, j in sides]
+        lengths = np.array([len(x) for x in sides.values()], int)
+        # Something between them ends each one's last run.
+        self.x = np.concatenate([[], *(part for x in sides.values() for part in (x, [-np.inf]))])
+        self.end = np.cumsum(lengths + 1) - 1
+        self.start = self.end - lengths
+        self.top = np.array([x.max() for x in sides.values()])
+        self.noise, self.quantum = np.array([known[j] for _, j in sides]).reshape(-1, 2).T
+        lowest = (1 - max(DEPTHS)) * self.top
+        self.high = np.flatnonzero(self.x >= np.repeat(lowest, lengths + 1))
+        peaks = [np.pad(_peaks(x), ((0, 1), (0, 0)), constant_values=i) for i, x in enumerate(sides.values())]
+        level, above, side = np.concatenate([np.zeros((3, 0)), *peaks], axis=1)
+        near = level + above >= lowest[side.astype(int)]
+        self.peaks, self.peak_side = np.stack([level, above])[:, near], side.astype(int)[near]
+
+    def above(self, level: Float[np.ndarray, "S"]) -> tuple[Int[np.ndarray, "R"], ...]:
+        """Runs of samples at or above each signal's level, with two samples on either side: side, start, end."""
+        at = self.high[self.x[self.high] >= level[np.searchsorted(self.end, self.high)]]
+        new = np.diff(at) > 1
+        start, end = at[np.append(True, new)[: len(at)]], at[np.append(new, True)[: len(at)]] + 1
+        side = np.searchsorted(self.end, start)
+        inner = (start - self.start[side] > 1) & (self.end[side] - end > 1)
+        return side[inner], start[inner], end[inner]
+
+    def total(self, values: Shaped[np.ndarray, "R"], side: Int[np.ndarray, "R"]) -> Float[np.ndarray, "S"]:
+        # Without any, NumPy counts in integers.
+        return np.bincount(side, values, self.count).astype(float)
+
+    def least(self, values: Float[np.ndarray, "R"], side: Int[np.ndarray, "R"]) -> Float[np.ndarray, "S"]:
+        """Infinite for those without any."""
+        found = np.full(self.count, np.inf)
+        np.minimum.at(found, side, values)
+        return found
 
 
 class _Tops:
-    """The runs of samples within `depth` of the maximum of one channel, and what their shapes say.
+    """The runs of samples within `depth` (of the maximum) of the maximum of each signal, and what their shapes say.
 
     Each measure is a sum over runs of the log-odds of a cut against a parabola. A run that looks like a
     parabola counts -1 at worst: it speaks against the rail, but a low peak may touch the band by itself.
     """
 
-    def __init__(self, x: np.ndarray, depth: float, noise: float, quantum: float, peaks: np.ndarray):
-        self.x, self.depth, self.noise, self.quantum, self.peaks = x, depth, noise, quantum, peaks
-        start, end = runs(x >= x.max() - depth)
-        # Two samples are needed on either side.
-        inner = (start > 1) & (end < len(x) - 1)
-        self.start, self.end = start[inner], end[inner]
-        self.n = self.end - self.start
-        pieces = np.stack([self.start, self.end], axis=1).ravel()
-        self.highest = np.maximum.reduceat(x, pieces)[::2] if len(pieces) else np.zeros(0)
-        self.lowest = np.minimum.reduceat(x, pieces)[::2] if len(pieces) else np.zeros(0)
-        entry = x[self.start] - x[self.start - 1]
-        leave = x[self.end - 1] - x[self.end]
-        self.step = (entry + leave) / 2
+    def __init__(self, sides: _Sides, depth: float):
+        self.sides, self.depth = sides, depth * sides.top
+        x = sides.x
+        self.side, start, end = sides.above(sides.top - self.depth)
+        self.n = end - start
+        pieces = np.stack([start, end], axis=1).ravel()
+        self.highest, self.lowest = (
+            piece.reduceat(x, pieces)[::2] if len(pieces) else np.zeros(0)
+            for piece in (np.maximum, np.minimum)
+        )
+        self.step = (x[start] - x[start - 1] + x[end - 1] - x[end]) / 2
         self.long = self.n > 2
-        self.peak = np.where(x[self.start] >= x[self.end - 1], self.start, self.end - 1)
+        self.peak = np.where(x[start] >= x[end - 1], start, end - 1)
         self.short = ~self.long & ~_whole(x, self.peak)
+        self.noise, self.quantum = sides.noise[self.side], sides.quantum[self.side]
+        self.flat = np.where(self.long, self._flat(), 0.0)
 
-    def _odds(self, rise: np.ndarray, spread: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def _odds(self, rise: np.ndarray, spread: np.ndarray, step: np.ndarray, used: np.ndarray) -> np.ndarray:
+        noise, quantum = self.noise[used], self.quantum[used]
         # Noise makes steps look steep, but never makes neighbours equal, unless the numbers are coarse.
-        certain = (spread == 0) & (self.quantum == 0)
-        steep = np.where(certain, step, step - 4 * self.noise)
+        certain = (spread == 0) & (quantum == 0)
+        steep = np.where(certain, step, step - 4 * noise)
         # Neighbours may agree by chance: no run counts as flatter than 2 % of its steps.
-        seen = np.maximum(spread + 2 * self.quantum, 0.02 * step)
-        odds = np.log(np.maximum(rise * steep, 1e-3 * seen) / seen)
+        seen = np.maximum(spread + 2 * quantum, 0.02 * step)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            odds = np.log(np.maximum(rise * steep, 1e-3 * seen) / seen)
         return np.where(steep > 0, np.maximum(odds, -1.0), 0.0)
 
     def _flat(self) -> np.ndarray:
@@ -147,53 +186,56 @@ class _Tops:
 
         Beyond ten samples the rise no longer counts: a smooth motion may hold a rate that long.
         """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            odds = self._odds(np.clip((self.n - 2) / 4, 0, 2), self.highest - self.lowest, self.step)
-        return np.where(self.long, odds, 0.0)
+        rise = np.clip((self.n - 2) / 4, 0, 2)
+        return self._odds(rise, self.highest - self.lowest, self.step, np.full(len(rise), True))
 
-    def flatness(self) -> float:
-        return float(self._flat().sum())
+    def flatness(self) -> Float[np.ndarray, "S"]:
+        return self.sides.total(self.flat, self.side)
 
-    def pairing(self) -> float:
+    def pairing(self) -> Float[np.ndarray, "S"]:
         """Of a parabola, the two highest samples differ by anything up to half of the mean step around them.
 
         A quarter is the median; half of that keeps the mean of the log-odds of whole peaks below zero.
         """
-        i = self.peak[self.short]
-        x = self.x
+        i, side, x = self.peak[self.short], self.side[self.short], self.sides.x
         j = np.where(x[i - 1] > x[i + 1], i - 1, i + 1)
         step = (x[i] - x[2 * i - j] + x[j] - x[2 * j - i]) / 2
-        with np.errstate(divide="ignore", invalid="ignore"):
-            odds = self._odds(np.full(len(i), 1 / 8), x[i] - x[j], step)
+        odds = self._odds(np.full(len(i), 1 / 8), x[i] - x[j], step, self.short)
         # Peaks of one sample, which are no pairs, do not speak against a common level.
-        within = x[j] >= self.highest.max(initial=-np.inf) - self.depth
-        return max(0.0, float(np.maximum(np.where(within, odds, np.minimum(odds, 0.0)), -0.7).sum()))
+        within = x[j] >= (self._top() - self.depth)[side]
+        counted = np.maximum(np.where(within, odds, np.minimum(odds, 0.0)), -0.7)
+        return np.maximum(0.0, self.sides.total(counted, side))
 
-    def levelling(self) -> float:
+    def levelling(self) -> Float[np.ndarray, "S"]:
         """Peaks of one or two samples that end within `depth` of each other, rather than within s/4.
 
         Under a parabola of equal heights the fraction within d is √(4d/s); Chernoff's bound on the chance
         of so many, given those that end a little lower.
         """
-        step = self.step[self.short]
+        side, step, sides = self.side[self.short], self.step[self.short], self.sides
         # Peaks with the same flanks, to 2 %, are one peak seen again: a vibration, not a coincidence.
-        k = len(np.unique(np.round(np.log(np.maximum(step, 1e-300)) / 0.02))) - 1
-        if k < 1:
-            return 0.0
-        p = np.sqrt(np.clip(4 * (self.depth + 2 * self.quantum) / step, 0.02, 1.0)).mean()
-        top, (level, reach) = self.highest.max(), self.peaks
-        n = k + int(np.sum((level < top - self.depth) & (level >= top - reach)))
-        q = k / n
-        if q <= p:
-            return 0.0
-        rest = (1 - q) * np.log((1 - q) / (1 - p)) if k < n else 0.0
-        return float(n * (q * np.log(q / p) + rest))
+        flanks = np.round(np.log(np.maximum(step, 1e-300)) / 0.02)
+        k = np.bincount(np.unique(np.stack([side, flanks]), axis=1)[0].astype(int), minlength=sides.count) - 1
+        reach = np.sqrt(np.clip(4 * (self.depth[side] + 2 * self.quantum[self.short]) / step, 0.02, 1.0))
+        level, above = sides.peaks
+        most = (self._top() - self.depth)[sides.peak_side]
+        lower = (level < most) & (level >= most + self.depth[sides.peak_side] - above)
+        n = k + sides.total(lower, sides.peak_side)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            p, q = sides.total(reach, side) / np.bincount(side, minlength=sides.count), k / n
+            rest = np.where(k < n, (1 - q) * np.log((1 - q) / (1 - p)), 0.0)
+            return np.where((k >= 1) & (q > p), n * (q * np.log(q / p) + rest), 0.0)
 
-    def edge(self, below: float = np.inf) -> float:
-        """The lowest sample of the plateaus, or of those alone that lie `below` a level and are clearly flat."""
-        odds = self._flat()
-        used = (odds > 0) | self.short if below == np.inf else (odds > 1) & (self.highest < below)
-        return float(self.lowest[used].min(initial=np.inf))
+    def _top(self) -> Float[np.ndarray, "S"]:
+        """The highest sample of each signal's runs."""
+        return -self.sides.least(-self.highest, self.side)
+
+    def edge(self, below: Float[np.ndarray, "S"] | None = None) -> Float[np.ndarray, "S"]:
+        """The lowest sample of each signal's plateaus, or of those that lie `below` a level and are clearly flat."""
+        used = (self.flat > 0) | self.short
+        if below is not None:
+            used = (self.flat > 1) & (self.highest < below[self.side])
+        return self.sides.least(self.lowest[used], self.side[used])
 
 
 def _noise(x: np.ndarray) -> float:
