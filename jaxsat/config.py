@@ -46,9 +46,14 @@ class Noise(_Section):
         default=0.02, gt=0, description="sd of the velocity of a resting sensor (m/s)"
     )
     rest_steady: float = Field(
-        default=0.5,
+        default=0.2,
         ge=0,
         description="that velocity stays alike for so long (s), which counts in what sd are claimed; 0: white",
+    )
+    rest_creep: float = Field(
+        default=0.005,
+        ge=0,
+        description="sd of what it takes of every way alike, a share of it, which counts in what sd are claimed",
     )
     initial_tilt_sd: float = Field(
         default=0.005, gt=0, description="sd of the initial tilt, mostly accelerometer bias (rad)"

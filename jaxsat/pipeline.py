@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsat.claims import Doubt, calibration_in_doubt, common_errors, doubt, with_rests_in_doubt
 from jaxsat.config import Config
 from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import Beside, computing, stored_jit
@@ -23,14 +24,7 @@ from jaxsat.inertial.smoother import (
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.preparation import (
-    calibrate_by_rests,
-    calibration_in_doubt,
-    constants_sd,
-    find_ground,
-    prepare,
-    with_rests_in_doubt,
-)
+from jaxsat.preparation import calibrate_by_rests, constants_sd, find_ground, prepare
 from jaxsat.saturation.compensate import (
     Fills,
     compensate_parallel,
@@ -88,6 +82,8 @@ class Estimate(eqx.Module):
     level: bool
     """The ground was found to be level: rests are at one height."""
     gyr_offset: Float[np.ndarray, "3"]
+    doubt: Doubt
+    """What is uncertain all through the recording; the trajectory's covariance counts it."""
     floor: ActiveSet | None
     """Active set of `height.mode = "nonnegative"`."""
     warnings: list[str] = eqx.field(static=True)
@@ -183,7 +179,10 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         found = compensated or standard
         # How sure the path is, is another question.
         sure = with_rests_in_doubt(sure, config)
-        covariance = _covariance(found, sure.on_ground(ground.result()))
+        problem = sure.on_ground(ground.result())
+        told = problem.rows.height is not None and found.floor is None
+        common = doubt(config, prepared.gyr_offset_sd, calibration, told)
+        covariance = _covariance(found, problem, common)
         calibration = doubted.result()
     clock.lap("smoother")
 
@@ -226,6 +225,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         gravity=float(trial.gravity),
         level=config.height.mode == "auto" and ground.result() is not None,
         gyr_offset=prepared.gyr_offset,
+        doubt=common,
         floor=floor,
         warnings=prepared.warnings,
         seconds=clock.seconds,
@@ -252,16 +252,20 @@ def displacements(found: Estimate) -> tuple[Float[np.ndarray, "S 3"], Float[np.n
         known = found.trajectory
         states = (pad(x, size) for x in (known.q_nb, known.velocity, position, known.covariance))
         with computing():
-            ways = _ways(problem, tuple(states), departure, arrival)
-        covariance[whole] = np.asarray(ways)[:count]
+            ways = _ways(problem, tuple(states), found.doubt, departure, arrival)
+        creep = found.doubt.creep * way[whole]
+        covariance[whole] = np.asarray(ways)[:count] + creep[:, :, None] * creep[:, None]
     return way, covariance
 
 
 @stored_jit
-def _ways(problem: Trial, states, departure, arrival):
+def _ways(problem: Trial, states, common: Doubt, departure, arrival):
     samples = Samples(problem.signal, problem.period, problem.variance)
     *state, covariance = states
     start = NavState(*state)
+    # What is the same error everywhere is no part of what a motion's own rests tell of it.
+    errors = common_errors(start, problem.period, problem.rows.rest, common)
+    covariance = covariance - errors @ jnp.swapaxes(errors, 1, 2)
     return displacement_covariance(
         start, covariance, samples, problem.rows, problem.prior_covariance, departure, arrival
     )
@@ -306,20 +310,23 @@ def _path(trial: Trial, config: Config) -> Path:
     return jax.block_until_ready(found)
 
 
-def _covariance(path: Path, trial: Trial) -> Float[Array, "N1 9 9"]:
-    """Of a path by the noise of `trial`; rests that touch the floor still do."""
+def _covariance(path: Path, trial: Trial, common: Doubt) -> Float[Array, "N1 9 9"]:
+    """Of a path by the noise of `trial` and what is in doubt all through; rests that touch the floor still do."""
     touching = None if path.floor is None else path.floor.active
     given = path.state, trial.signal, trial.period, trial.variance, trial.rows, touching
-    return jax.block_until_ready(_about(*given, trial.prior, trial.prior_covariance, trial.gravity))
+    known = trial.prior, trial.prior_covariance, trial.gravity
+    return jax.block_until_ready(_about(*given, *known, common))
 
 
 @stored_jit
-def _about(state, signal, period, variance, rows, touching, prior, prior_covariance, gravity):
+def _about(state, signal, period, variance, rows, touching, prior, prior_covariance, gravity, common: Doubt):
+    errors = common_errors(state, period, rows.rest, common)
     if touching is not None:
         exact = jnp.zeros_like(rows.height_variance)
         rows = Rows(rows.rest, rows.velocity_variance, touching, exact, rows.velocity)
     samples = Samples(signal, period, variance)
-    return smooth_about(state, samples, rows, prior, prior_covariance, gravity).covariance
+    covariance = smooth_about(state, samples, rows, prior, prior_covariance, gravity).covariance
+    return covariance + errors @ jnp.swapaxes(errors, 1, 2)
 
 
 @stored_jit

@@ -16,12 +16,12 @@ from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
 from jaxsat.saturation.compensate import FIRST_STEPS, calibrate_recording, filter_recording
 from jaxsat.saturation.false_rests import false_rests
-from jaxsat.saturation.layout import Arrays, Trial, pad
+from jaxsat.saturation.layout import Trial, pad
 from jaxsat.saturation.level_ground import ROW, is_level
 from jaxsat.signals.checks import check
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording, sensor_changes
-from jaxsat.signals.rests import Segments, find_rests, find_segments, resting_rate, runs
+from jaxsat.signals.rests import Segments, find_rests, find_segments, resting_rate
 from jaxsat.signals.support import find_support
 
 # Up to so long before its first rest (s) a recording's tilt is as well known as in it.
@@ -43,6 +43,7 @@ class Prepared(eqx.Module):
     """First samples of rests that may be on the ground, padded; None where it is not asked for, or by too few."""
     gyr_offset: Float[np.ndarray, "3"]
     """What was taken off the rates (rad/s)."""
+    gyr_offset_sd: Float[np.ndarray, "3"]
     rails: Rails
     rest: Bool[np.ndarray, "N"]
     segments: Segments
@@ -73,7 +74,7 @@ def _prepare(recording: Recording, config: Config) -> Prepared:
     )
     rest = rest & ~at_rail & ~recording.missing.all(axis=1)
     while True:
-        trial, offset, grounded = _trial(recording, config, rest, sign)
+        trial, (offset, offset_sd), grounded = _trial(recording, config, rest, sign)
         segments = find_segments(rest)
         # Saturated values may be anything within their bounds here.
         filtered = filter_recording(trial, trial.signal, trial.unfilled_variance)
@@ -86,7 +87,9 @@ def _prepare(recording: Recording, config: Config) -> Prepared:
                 f"the rest from {recording.time[start]:.2f} to {recording.time[end]:.2f} s is left out: the motions "
                 "before and after it say that the sensor moved."
             )
-    return Prepared(trial, grounded, offset, rails, rest, segments, find_gaps(sign), sign, warnings)
+    return Prepared(
+        trial, grounded, offset, offset_sd, rails, rest, segments, find_gaps(sign), sign, warnings
+    )
 
 
 def constants_sd(config: Config) -> Float[Array, "9"] | None:
@@ -101,24 +104,6 @@ def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
     for _ in range(FIRST_STEPS if sd is not None else 0):
         found = calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, found)
     return found
-
-
-def calibration_in_doubt(
-    trial: Trial,
-    config: Config,
-    found: Calibration,
-    signal: Float[Arrays, "P 6"],
-    extra: Float[Arrays, "P 6"],
-) -> Calibration:
-    """The same constants with the sd that `with_rests_in_doubt` leaves.
-
-    signal, extra: what they were found from, as for `calibrate_recording`.
-    """
-    sd = constants_sd(config)
-    if sd is None:
-        return found
-    doubted = calibrate_recording(with_rests_in_doubt(trial, config), signal, extra, sd, found)
-    return Calibration(found.constants, doubted.sd)
 
 
 def find_ground(
@@ -136,26 +121,10 @@ def find_ground(
     return grounded if is_level(trial.calibrated(known), grounded) else None
 
 
-def with_rests_in_doubt(trial: Trial, config: Config) -> Trial:
-    """With the variance of resting velocities that claims of sd rest on; the path takes them as white.
-
-    A foot that is taken to rest creeps on: its velocity is alike for `noise.rest_steady` (a rest tells it once, not
-    once a sample), and the point that stands still wanders from heel to toe by `smoother.lever_sd`.
-    """
-    rest = np.asarray(trial.rows.rest)
-    starts, ends = runs(rest)
-    alike = np.minimum(ends - starts, config.noise.rest_steady / trial.period[0])
-    times = np.ones(len(rest))
-    times[rest] = np.repeat(np.maximum(alike, 1.0), ends - starts)
-    turning = np.sum(np.asarray(trial.signal)[:, :3] ** 2, axis=1)
-    variance = (np.asarray(trial.rows.velocity_variance) + config.smoother.lever_sd**2 * turning) * times
-    return eqx.tree_at(lambda t: t.rows.velocity_variance, trial, variance)
-
-
 def _trial(
     recording: Recording, config: Config, rest: Bool[np.ndarray, "N"], sign: Int[np.ndarray, "N 6"]
-) -> tuple[Trial, Float[np.ndarray, "3"], Bool[np.ndarray, "P"] | None]:
-    """The recording as the smoother wants it, the gyroscope offset (rad/s) taken off, and `Prepared.grounded`."""
+) -> tuple[Trial, Float[np.ndarray, "2 3"], Bool[np.ndarray, "P"] | None]:
+    """The recording as the smoother wants it, the offset taken off the rates and its sd, and `Prepared.grounded`."""
     n, T, signal = len(recording), recording.period, recording.signal
     started = np.flatnonzero(rest)
     if not len(started):
@@ -169,10 +138,10 @@ def _trial(
     # The first rest at a foot's first step includes its first stir: leave out its last tenth of a second.
     quiet = slice(first, max(first + 1, first_rest.stop - round(0.1 / T)))
 
-    offset = np.zeros(3)
+    offset = np.zeros((2, 3))
     if config.smoother.gyr_offset == "rests":
         offset = resting_rate(signal[:, :3], rest, T)
-    signal = signal - np.concatenate([offset, np.zeros(3)])
+    signal = signal - np.concatenate([offset[0], np.zeros(3)])
     up = signal[quiet, 3:].mean(axis=0)
     gravity = np.linalg.norm(up) if config.gravity == "auto" else float(config.gravity)
 

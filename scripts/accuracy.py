@@ -226,7 +226,7 @@ PARTS = {
 
 
 def intervals(data: Path) -> pd.DataFrame:
-    """Of `map`: on walks clipped in software, where what each should have held is known, and strides by Vicon."""
+    """Of `map`: on walks clipped in software, where what each should have held is known, and paths by Vicon."""
     folder, scores = data / "pyshoe", []
     splits = tomllib.loads((folder / "splits.toml").read_text())
     walks = {name: (read(folder / f"{name}.mat", rest_column="zv_shoe_opt"), 250) for name in splits["clip"]}
@@ -240,19 +240,19 @@ def intervals(data: Path) -> pd.DataFrame:
         found = estimate(clip(recording, gyr=rail), load_config(None, method="map"))
         scores += accuracy_intervals.held(f"{name}, {rail} °/s", recording, found)
         if name in walks:
-            scores += strides(folder, name, f"{name}, {rail} °/s", found)
+            scores += by_vicon(folder, name, f"{name}, {rail} °/s", found)
         print("intervals", name, flush=True)
     for name in splits["saturated"]:
         recording = read(folder / f"{name}.mat", rest_column="zv_shoe_opt")
-        scores += strides(
+        scores += by_vicon(
             folder, name, name, estimate(recording, load_config(None, method="map")), "saturated "
         )
     return accuracy_intervals.summary(pd.DataFrame(scores))
 
 
-def strides(folder: Path, name: str, label: str, found: Estimate, which: str = "") -> Iterator[dict]:
+def by_vicon(folder: Path, name: str, label: str, found: Estimate, which: str = "") -> Iterator[dict]:
     _, truth = load_pyshoe_truth(folder / f"{name}.mat", at=found.recording.time)
-    return accuracy_intervals.strides_held(label, found, truth, pyshoe_point(folder, name), which)
+    return accuracy_intervals.path_held(label, found, truth, pyshoe_point(folder, name), which)
 
 
 def merged(before: pd.DataFrame, table: pd.DataFrame, parts: list[str], methods: list[str]) -> pd.DataFrame:

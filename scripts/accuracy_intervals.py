@@ -1,4 +1,4 @@
-"""How often the intervals of `map` hold what real recordings clipped in software lost, and the strides of Vicon."""
+"""How often the intervals of `map` hold what real recordings clipped in software lost, and what Vicon saw."""
 
 from collections.abc import Iterator
 
@@ -21,11 +21,17 @@ WHAT = {
     "impulses": "impulses of gaps",
     "lengths": "lengths of clipped strides",
     "climbs": "climbs of clipped strides",
+    "distances": "distances of rests of clipped walks from the start",
+    "heights": "heights of rests of clipped walks",
     "saturated lengths": "lengths of strides of saturated trials",
     "saturated climbs": "climbs of strides of saturated trials",
+    "saturated distances": "distances of rests of saturated trials from the start",
+    "saturated heights": "heights of rests of saturated trials",
 }
 # Shorter ways are no strides, and cameras lose a foot whose stride they see that much longer or shorter (m).
 STRIDE, LOST = 0.5, 0.3
+# From so far on (m) a place has a distance from the start.
+AWAY = 1.0
 
 
 def held(name: str, recording: Recording, found: Estimate) -> Iterator[dict]:
@@ -50,26 +56,41 @@ def held(name: str, recording: Recording, found: Estimate) -> Iterator[dict]:
         yield {**one, "what": "impulses", "z": (gap["impulse"] - impulse) / gap["impulse_sd"]}
 
 
-def strides_held(
+def path_held(
     name: str, found: Estimate, truth: Float[np.ndarray, "N 3"], point: TrackedPoint, which: str = ""
 ) -> Iterator[dict]:
-    """Of a PyShoe trial: errors over their sd of what each stride is long and climbs; truth (m): at its samples."""
+    """Of a PyShoe trial: errors over their sd of what each stride is long and climbs, and of where it begins.
+
+    truth (m): at its samples. Neither turns nor shifts change these.
+    """
     time, path = found.recording.time, found.trajectory
     tracked = point.path(time, path.position, path.q_nb)
     late = TrackedPoint(np.zeros(3), point.lag).path(time, path.position, path.q_nb)
     # Where the sensor was, in the frame of the estimate.
     sensor = align_yaw_translation(truth, tracked) - (tracked - late)
+
+    def seen(at):
+        return np.stack([np.interp(at + point.lag, time, x) for x in sensor.T], axis=1)
+
     strides = segments_table(found).dropna(subset=["length_sd", "climb_sd"])
-    ends = strides[["start", "end"]].to_numpy() + point.lag - [found.recording.period, 0.0]
-    start, end = (np.stack([np.interp(at, time, x) for x in sensor.T], axis=1) for at in ends.T)
-    way = end - start
+    start, end = strides["start"].to_numpy() - found.recording.period, strides["end"].to_numpy()
+    way = seen(end) - seen(start)
     errors = {
         "lengths": strides["length"].to_numpy() - np.hypot(*way[:, :2].T),
         "climbs": strides["climb"].to_numpy() - way[:, 2],
     }
-    seen = (strides["length"].to_numpy() > STRIDE) & (np.abs([*errors.values()]).max(axis=0) < LOST)
-    for what, error in errors.items():
-        for z in (error / strides[f"{what[:-1]}_sd"].to_numpy())[seen]:
+    used = (strides["length"].to_numpy() > STRIDE) & (np.abs([*errors.values()]).max(axis=0) < LOST)
+    scores = {what: (error / strides[f"{what[:-1]}_sd"].to_numpy())[used] for what, error in errors.items()}
+    begins = found.segments.departure[found.segments.departure >= 0]
+    place, there = (x - x[0] for x in (path.position[begins], seen(time[begins])))
+    covariance, distance = path.covariance[begins, 3:6, 3:6], np.hypot(*place[:, :2].T)
+    away = distance > AWAY
+    outward = place[away, :2] / distance[away, None]
+    sd = np.sqrt(np.einsum("ni,nij,nj->n", outward, covariance[away, :2, :2], outward))
+    scores["distances"] = (distance - np.hypot(*there[:, :2].T))[away] / sd
+    scores["heights"] = (place - there)[away, 2] / np.sqrt(covariance[away, 2, 2])
+    for what, errors_over_sd in scores.items():
+        for z in errors_over_sd:
             yield {"trial": name, "sensor": "path", "what": f"{which}{what}", "z": float(z)}
 
 

@@ -157,12 +157,21 @@ def test_a_stride_is_compared_with_that_of_the_sensor_not_of_the_marker(board):
     sensor = path.position * [1.05, 1.05, 1.0] + np.stack([0 * climbing, 0 * climbing, climbing], axis=1)
     marker = sensor + point.path(path.time, path.position, path.q_nb) - path.position
     turned = Rotation.from_euler("z", 1.0).apply(marker) + np.array([5.0, 1.0, 2.0])
-    rows = pd.DataFrame(intervals.strides_held("walk", found, turned, point)).set_index("what")
+    rows = pd.DataFrame(intervals.path_held("walk", found, turned, point)).set_index("what")
     away = rows.loc["lengths", "z"].to_numpy() * strides["length_sd"].to_numpy()
     assert len(away) == 5
     np.testing.assert_allclose(away, -0.05 * lengths, atol=2e-3)
     climbs = rows.loc["climbs", "z"].to_numpy() * strides["climb_sd"].to_numpy()
     np.testing.assert_allclose(climbs, -0.01, atol=1e-3)
+    begins = found.segments.departure[found.segments.departure >= 0]
+    place = path.position[begins] - path.position[begins[0]]
+    sd = np.sqrt(path.covariance[begins, 5, 5])
+    # The first is where heights and distances are counted from.
+    heights = rows.loc["heights", "z"].to_numpy() * sd[1:]
+    np.testing.assert_allclose(heights, -0.01 * np.arange(1, len(begins)), atol=1e-3)
+    along = path.covariance[begins, 3, 3][1:] ** 0.5
+    distances = rows.loc["distances", "z"].to_numpy() * along
+    np.testing.assert_allclose(distances, -0.05 * place[1:, 0], atol=3e-3)
 
 
 @pytest.mark.parametrize("vertical", [True, False])

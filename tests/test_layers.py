@@ -13,6 +13,7 @@ ORDER = (
     "saturation",
     "config",
     "preparation",
+    "claims",
     "pipeline",
     "attitude",
     "periodic",

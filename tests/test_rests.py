@@ -230,7 +230,7 @@ def swaying(n: int, sway: float, seed: int = 0) -> np.ndarray:
 
 
 def test_a_gyroscope_that_lies_still_says_its_offset():
-    found = resting_rate(swaying(600, sway=0.0), np.ones(600, bool), PERIOD)
+    found, _ = resting_rate(swaying(600, sway=0.0), np.ones(600, bool), PERIOD)
     np.testing.assert_allclose(found, OFFSET, atol=2e-4)
 
 
@@ -239,11 +239,11 @@ def test_a_rest_that_sways_is_believed_as_far_as_it_goes():
     rest, errors = np.ones(400, bool), []
     for seed in range(40):
         rates = swaying(400, sway=0.02, seed=seed) - OFFSET
-        errors.append([resting_rate(rates, rest, PERIOD), rates.mean(axis=0)])
+        errors.append([resting_rate(rates, rest, PERIOD)[0], rates.mean(axis=0)])
     shrunk, mean = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
     assert shrunk < 0.8 * mean
     # Where there is a large one, it is not mistaken for sway.
-    large = [resting_rate(swaying(400, sway=0.002, seed=seed), rest, PERIOD) for seed in range(40)]
+    large = [resting_rate(swaying(400, sway=0.002, seed=seed), rest, PERIOD)[0] for seed in range(40)]
     assert np.abs(np.mean(large, axis=0) - OFFSET).max() < OFFSET_SD
 
 
@@ -252,9 +252,10 @@ def test_a_quiet_rest_outweighs_a_stirring_one_and_short_ones_are_not_asked():
     moving = np.full((100, 3), 3.0)
     rates = np.concatenate([stirring, moving, quiet])
     rest = np.abs(rates).max(axis=1) < 2.0
-    np.testing.assert_allclose(resting_rate(rates, rest, PERIOD), OFFSET, atol=1e-3)
+    np.testing.assert_allclose(resting_rate(rates, rest, PERIOD)[0], OFFSET, atol=1e-3)
     short = rest & (np.arange(len(rest)) < 150)
-    assert not resting_rate(rates, short, PERIOD).any()
+    offset, sd = resting_rate(rates, short, PERIOD)
+    assert not offset.any() and (sd == OFFSET_SD).all()
 
 
 def test_a_change_is_that_of_a_sensor_to_the_farther_neighbour():

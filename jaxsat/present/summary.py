@@ -55,6 +55,7 @@ def summarise(estimate: Estimate, source: Path | None = None) -> dict[str, Any]:
         "gravity": float(estimate.gravity),
         "heights": heights_of(estimate),
         "gyr_offset": estimate.gyr_offset.tolist(),
+        "gyr_offset_sd": estimate.doubt.gyr_offset.tolist(),
         "bias": dict(zip(CHANNELS, constants[:6], strict=True)),
         "bias_sd": dict(zip(CHANNELS, constants_sd[:6], strict=True)),
         "lever": constants[6:],

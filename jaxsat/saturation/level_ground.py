@@ -27,10 +27,10 @@ def is_level(trial: Trial, grounded: Bool[np.ndarray, "N"]) -> bool:
     """
     arrivals = np.flatnonzero(grounded)
     # Saturated values may be anything within their bounds here.
-    free, told = (
-        np.asarray(filter_recording(t, t.signal, t.unfilled_variance).cost)
-        for t in (trial, trial.on_ground(grounded))
-    )
+    costs = [
+        filter_recording(t, t.signal, t.unfilled_variance).cost for t in (trial, trial.on_ground(grounded))
+    ]
+    free, told = map(np.asarray, costs)
     each = np.add.reduceat(told - free, arrivals)
     in_row = np.convolve(each, np.full(ROW, 1.0 / ROW), "valid")
     return bool(in_row.max() <= MOST_IN_ROW and each.max() <= MOST_ALONE)

@@ -197,8 +197,8 @@ def find_segments(rest: Bool[np.ndarray, "N"]) -> Segments:
 
 def resting_rate(
     gyr: Float[np.ndarray, "N 3"], rest: Bool[np.ndarray, "N"], period: float
-) -> Float[np.ndarray, "3"]:
-    """Offset of a gyroscope from its mean rates at rests (rad/s), each axis by itself.
+) -> Float[np.ndarray, "2 3"]:
+    """Offset of a gyroscope from its mean rates at rests, each axis by itself, and its sd (rad/s).
 
     A foot that stands turns by a degree, which within a second passes for a large offset. So each rest counts by
     the variance of its mean, from the means of its blocks, and an offset that is not clear of the sway is shrunk by
@@ -215,7 +215,8 @@ def resting_rate(
         precision = count / np.maximum(means.var(axis=0, ddof=1), 1e-8)
         weight, total = weight + precision, total + precision * inside.mean(axis=0)
     if not weight.any():
-        return total
+        return np.stack([total, np.full(3, OFFSET_SD)])
     mean, variance = total / weight, 1.0 / weight
     clear = np.abs(mean) > CLEAR * np.sqrt(variance)
-    return np.where(clear, mean, mean * OFFSET_SD**2 / (OFFSET_SD**2 + variance))
+    believed = np.where(clear, 1.0, OFFSET_SD**2 / (OFFSET_SD**2 + variance))
+    return np.stack([believed * mean, np.sqrt(believed * variance)])
