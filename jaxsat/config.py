@@ -50,11 +50,6 @@ class Noise(_Section):
         ge=0,
         description="that velocity stays alike for so long (s), which counts in what sd are claimed; 0: white",
     )
-    rest_creep: float = Field(
-        default=0.005,
-        ge=0,
-        description="sd of what it takes of every way alike, a share of it, which counts in what sd are claimed",
-    )
     initial_tilt_sd: float = Field(
         default=0.005, gt=0, description="sd of the initial tilt, mostly accelerometer bias (rad)"
     )

@@ -149,7 +149,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         sure = trial.calibrated(calibration)
         ground = beside.submit(find_ground, prepared, config, calibration)
         ignoring = beside.submit(lambda trial: _path(trial.on_ground(ground.result()), config), sure)
-        compensated, taken = None, (trial.signal, trial.unfilled_variance)
+        fills, compensated = None, None
         if options is not None and learning is not None:
 
             def learned(prior=learning):
@@ -165,25 +165,26 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
             else:
                 fills, calibration = compensate_sequential(*given, report)
             clock.lap("compensation")
-            taken = fills.signal, fills.variance
+        taken = fills or Fills.nothing(trial, len(segments))
+        doubted = beside.submit(
+            calibration_in_doubt, trial, config, calibration, taken.signal, taken.variance
+        )
+        if fills is not None:
             filled = eqx.tree_at(lambda t: t.signal, trial, fills.signal).calibrated(calibration)
             path, sure = (
                 eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
                 for extra in (fills.slack, fills.variance)
             )
             compensated = _path(path.on_ground(ground.result()), config)
-        else:
-            fills = Fills.nothing(trial, len(segments))
-        doubted = beside.submit(calibration_in_doubt, trial, config, calibration, *taken)
         standard = ignoring.result()
         found = compensated or standard
+        calibration = doubted.result()
         # How sure the path is, is another question.
         sure = with_rests_in_doubt(sure, config)
-        problem = sure.on_ground(ground.result())
-        told = problem.rows.height is not None and found.floor is None
+        grounded = sure.on_ground(ground.result())
+        told = grounded.rows.height is not None and found.floor is None
         common = doubt(config, prepared.gyr_offset_sd, calibration, told)
-        covariance = _covariance(found, problem, common)
-        calibration = doubted.result()
+        covariance = _covariance(found, grounded, common)
     clock.lap("smoother")
 
     n = len(recording)
@@ -192,7 +193,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         named = f.signal, f.variance, f.slack, f.sd, f.gap_sd, f.identified, f.at_bound, f.inflated
         return *named, *jax.tree.leaves(f.heard)
 
-    fills = eqx.tree_at(sampled, fills, [x[:n] for x in sampled(fills)])
+    fills = eqx.tree_at(sampled, taken, [x[:n] for x in sampled(taken)])
     floor = found.floor
     if floor is not None:
         floor = eqx.tree_at(lambda f: f.active, floor, floor.active[:n])
@@ -253,8 +254,7 @@ def displacements(found: Estimate) -> tuple[Float[np.ndarray, "S 3"], Float[np.n
         states = (pad(x, size) for x in (known.q_nb, known.velocity, position, known.covariance))
         with computing():
             ways = _ways(problem, tuple(states), found.doubt, departure, arrival)
-        creep = found.doubt.creep * way[whole]
-        covariance[whole] = np.asarray(ways)[:count] + creep[:, :, None] * creep[:, None]
+        covariance[whole] = np.asarray(ways)[:count]
     return way, covariance
 
 
@@ -264,11 +264,16 @@ def _ways(problem: Trial, states, common: Doubt, departure, arrival):
     *state, covariance = states
     start = NavState(*state)
     # What is the same error everywhere is no part of what a motion's own rests tell of it.
-    errors = common_errors(start, problem.period, problem.rows.rest, common)
-    covariance = covariance - errors @ jnp.swapaxes(errors, 1, 2)
-    return displacement_covariance(
-        start, covariance, samples, problem.rows, problem.prior_covariance, departure, arrival
+    given = start, problem.signal[:, :3], problem.period, problem.rows.rest
+    errors = common_errors(*given, common)
+    own = covariance - errors @ jnp.swapaxes(errors, 1, 2)
+    ways = displacement_covariance(
+        start, own, samples, problem.rows, problem.prior_covariance, departure, arrival
     )
+    # An offset turns a way and leaves it as long; a lever makes it longer, and climb where heights are not told.
+    free = common_errors(*given, common._replace(height=jnp.zeros(())))
+    lever = (free[arrival] - free[departure])[:, 3:6, 3:6]
+    return ways + lever @ jnp.swapaxes(lever, 1, 2)
 
 
 class _Clock:
@@ -320,7 +325,7 @@ def _covariance(path: Path, trial: Trial, common: Doubt) -> Float[Array, "N1 9 9
 
 @stored_jit
 def _about(state, signal, period, variance, rows, touching, prior, prior_covariance, gravity, common: Doubt):
-    errors = common_errors(state, period, rows.rest, common)
+    errors = common_errors(state, signal[:, :3], period, rows.rest, common)
     if touching is not None:
         exact = jnp.zeros_like(rows.height_variance)
         rows = Rows(rows.rest, rows.velocity_variance, touching, exact, rows.velocity)

@@ -4,6 +4,7 @@ import importlib
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -13,10 +14,12 @@ from scipy.spatial.transform import Rotation
 from jaxsat.claims import Doubt, common_errors, with_rests_in_doubt
 from jaxsat.config import load_config
 from jaxsat.demo import load_walk
+from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import computing
 from jaxsat.inertial.strapdown import NavState
-from jaxsat.pipeline import estimate
+from jaxsat.pipeline import _path, estimate
 from jaxsat.preparation import prepare
+from jaxsat.present.tables import segments_table
 from jaxsat.signals.rests import runs
 from jaxsat.studies.tracked_point import find_tracked_point
 
@@ -33,7 +36,7 @@ def walk():
 @pytest.fixture(scope="module")
 def found(walk):
     """With velocities of rests that are white, as the path has them, and as they are by default."""
-    white = {"noise.rest_steady": 0.0, "noise.rest_creep": 0.0}
+    white = {"noise.rest_steady": 0.0}
     return [estimate(walk[0], load_config(None, method="standard", **given)) for given in (white, {})]
 
 
@@ -48,7 +51,7 @@ def intervals():
 
 def test_claims_are_wider_and_paths_the_same(walk, found):
     white = found[0]
-    half = {"noise.rest_steady": 0.5, "noise.rest_creep": 0.0}
+    half = {"noise.rest_steady": 0.5}
     steady = estimate(walk[0], load_config(None, method="standard", **half))
     np.testing.assert_array_equal(steady.trajectory.position, white.trajectory.position)
     np.testing.assert_array_equal(steady.trajectory.q_nb, white.trajectory.q_nb)
@@ -77,12 +80,13 @@ def test_a_rest_counts_once_in_each_time_that_its_velocity_stays_alike(walk):
         np.testing.assert_allclose(doubted[start:end], expected, rtol=1e-12)
 
 
-def errors_of(found, offset, creep=0.0, height=0.0):
-    path, period = found.trajectory, np.full(len(found.recording), found.recording.period)
+def errors_of(found, offset=0.0, lever=0.0, height=0.0):
+    problem, n, path = found.problem, len(found.recording), found.trajectory
     with computing():
         state = NavState(*map(jnp.asarray, (path.q_nb, path.velocity, path.position)))
-        common = Doubt(*map(jnp.asarray, (offset, creep, height)))
-        return np.asarray(common_errors(state, jnp.asarray(period), jnp.asarray(found.rest), common))
+        given = (jnp.asarray(x)[:n] for x in (problem.signal[:, :3], problem.period, problem.rows.rest))
+        common = Doubt(*(jnp.asarray(np.broadcast_to(x, 3)) for x in (offset, lever)), jnp.asarray(height))
+        return np.asarray(common_errors(state, *given, common))
 
 
 def test_an_offset_turns_the_way_as_its_sd_says(walk):
@@ -103,19 +107,49 @@ def test_an_offset_turns_the_way_as_its_sd_says(walk):
         assert axis != 0 or (error[-1, 2] > 0.03 and np.abs(error[:, 3:5]).max() > 0.25)
 
 
+def test_a_lever_that_is_wrong_moves_the_way_as_its_sd_says(walk):
+    """Rests about a point 2 cm away from the one that was found, the path anew."""
+    recording, _ = walk
+    config = load_config(None, method="standard", **{"height.mode": "off", "smoother.acc_bias_sd": 0.0})
+    found = estimate(recording, config)
+    n, trial = len(recording), prepare(recording, config).trial
+    for axis in range(3):
+        constants = np.array(found.calibration.constants)
+        constants[6 + axis] += 0.02
+        with computing():
+            other = trial.calibrated(Calibration(jnp.asarray(constants), jnp.zeros(9)))
+            moved = np.asarray(_path(other, config).state.position)[:n] - found.trajectory.position
+        predicted = errors_of(found, lever=0.02 * np.eye(3)[axis])[:, 3:6, 3 + axis]
+        # Along the axis that moves most; a rest takes its velocity as known to 2 cm/s, not as exact.
+        most = np.abs(predicted).max(axis=0).argmax()
+        seen, said = -moved[:, most], predicted[:, most]
+        assert np.vdot(seen, said) / np.vdot(said, said) == pytest.approx(1.0, abs=0.15)
+        np.testing.assert_allclose(-moved, predicted, atol=0.02)
+        assert np.abs(said).max() > 0.02
+
+
 def test_what_is_wrong_all_through_is_in_the_covariance(found):
     steady = found[1]
     path, common = steady.trajectory, steady.doubt
-    assert (common.gyr_offset > 0).all() and common.creep == 0.005 and common.height == 0.01
+    assert (common.gyr_offset > 0).all() and common.height == 0.01
+    np.testing.assert_array_equal(common.lever, steady.calibration.sd[6:])
     errors = errors_of(steady, *common)
-    assert not errors[0, :6].any()
-    # Each way is as much too long as all of it, and any later rest as much too high as the first was too low.
-    np.testing.assert_allclose(errors[:, 3:6, 3], 0.005 * (path.position - path.position[0]), atol=1e-12)
-    assert (errors[len(errors) // 2 :, 5, 4] == 0.01).all()
+    # Any later rest is as much too high as the first was too low.
+    assert not errors[0, :6].any() and (errors[len(errors) // 2 :, 5, 6] == 0.01).all()
     left = path.covariance - errors @ errors.swapaxes(1, 2)
     assert np.linalg.eigvalsh(left[::100]).min() > -1e-9
     # Of the heading's variance at the end the offset makes up most.
     assert path.covariance[-1, 2, 2] > 4 * left[-1, 2, 2] > 0
+    lengths = [np.median(segments_table(one)["length_sd"]) for one in (steady, without_lever(steady))]
+    assert lengths[0] > 1.02 * lengths[1]
+
+
+def without_lever(found):
+    """The same estimate, as sure of its lever as can be."""
+    errors = errors_of(found, lever=found.doubt.lever)
+    known = found.trajectory.covariance - errors @ errors.swapaxes(1, 2)
+    given = known, np.zeros(3)
+    return eqx.tree_at(lambda f: (f.trajectory.covariance, f.doubt.lever), found, given)
 
 
 def test_an_offset_that_is_not_asked_for_is_not_in_doubt(walk):

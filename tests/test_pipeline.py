@@ -253,7 +253,7 @@ def test_height_modes_hold_the_rests_at_or_above_the_floor():
 
 def test_covariance_grows_in_motion_and_is_small_at_rest():
     recording, truth = walk(4)
-    still = {"noise.rest_steady": 0.0, "noise.rest_creep": 0.0, "smoother.lever_sd": 0.0}
+    still = {"noise.rest_steady": 0.0, "smoother.lever_sd": 0.0}
     found = estimate(recording, load_config(None, method="standard", **still))
     speed_sd = np.sqrt(np.einsum("kii->ki", found.trajectory.covariance)[:, 6:].max(axis=1))
     assert speed_sd[truth.rest].max() < 0.011

@@ -23,7 +23,7 @@ from jaxsat.studies.motions import Bar
 from jaxsat.studies.simulate import Sensor, simulate
 
 AXES = "xyz"
-STILL = {"noise.rest_steady": 0.0, "noise.rest_creep": 0.0, "smoother.lever_sd": 0.0}
+STILL = {"noise.rest_steady": 0.0, "smoother.lever_sd": 0.0}
 TRAJECTORY = [
     "time",
     *("q_w", "q_x", "q_y", "q_z"),
