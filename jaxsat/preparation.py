@@ -44,6 +44,7 @@ class Prepared(eqx.Module):
     gyr_offset: Float[np.ndarray, "3"]
     """What was taken off the rates (rad/s)."""
     gyr_offset_sd: Float[np.ndarray, "3"]
+    """How well that is known (rad/s); zero where none was asked for."""
     rails: Rails
     rest: Bool[np.ndarray, "N"]
     segments: Segments
