@@ -8,15 +8,12 @@ that stands still are known as well as the rests tell them; and level ground is 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from jaxsat.config import Config
 from jaxsat.inertial.calibration import Calibration
-from jaxsat.inertial.rotations import quat_to_matrix, skew
-from jaxsat.inertial.strapdown import NavState
 from jaxsat.preparation import constants_sd
 from jaxsat.saturation.compensate import calibrate_recording
 from jaxsat.saturation.layout import Arrays, Trial
@@ -43,60 +40,57 @@ def doubt(
 
 
 def common_errors(
-    state: NavState,
-    rates: Float[Array, "P 3"],
-    period: Float[Array, "P"],
-    rest: Bool[Array, "P"],
+    q_nb: Float[np.ndarray, "N 4"],
+    position: Float[np.ndarray, "N 3"],
+    velocity: Float[np.ndarray, "N 3"],
+    rates: Float[np.ndarray, "N 3"],
+    rest: Bool[np.ndarray, "N"],
+    period: float,
     common: Doubt,
-) -> Float[Array, "N 9 7"]:
+) -> Float[np.ndarray, "N 9 7"]:
     """By how much one sd of each doubt moves each state's [θ, r, v]; they are independent, so squares add up.
 
-    state: of N ≤ P + 1, at the starts of samples; rates: rad/s. Tilt is what rests tell anew each time: of an
-    offset's turns those about the vertical are left, and with them the way turns. A lever that is wrong by e gives a
-    rest a velocity that is wrong by ω × e on average, and the motion between two rests what lies between theirs.
+    rates: rad/s, by samples of `period` (s). Tilt is what rests tell anew each time: of an offset's turns those about
+    the vertical are left, and with them the way turns. A lever that is wrong by e gives a rest a velocity that is
+    wrong by ω × e on average, and the motion between two rests what lies between theirs.
     """
-    count = len(state.q_nb) - 1
-    rates, period, rest = rates[:count], period[:count, None], rest[:count]
-    bodies = jax.vmap(quat_to_matrix)(state.q_nb)
-
-    def summed(changes):
-        return jnp.concatenate([jnp.zeros_like(changes[:1]), jnp.cumsum(changes, axis=0)])
-
-    heading = summed(bodies[:-1, 2] * common.gyr_offset[None] * period)
-    zero = jnp.zeros((count + 1, 3, 3))
-
-    def turned(ways, heading):
-        """By a small turn about the vertical."""
-        return jnp.stack([-ways[:, 1:2] * heading, ways[:, 0:1] * heading, jnp.zeros_like(heading)], axis=1)
-
-    offset = (
-        zero.at[:, 2].set(heading),
-        summed(turned(jnp.diff(state.position, axis=0), heading[:-1])),
-        turned(state.velocity, heading),
-    )
-    moving = bodies[:-1] @ jax.vmap(skew)(rates) * common.lever[None, None]
+    errors = np.zeros((len(rest), 9, 7))
+    # SciPy's quaternions have w last.
+    bodies = Rotation.from_quat(np.roll(q_nb, -1, axis=1)).as_matrix()
+    heading = _summed(bodies[:, 2] * common.gyr_offset * period)
+    errors[:, 2, :3] = heading
+    # A small turn about the vertical, of the way and of the velocity.
+    ways = np.diff(position, axis=0, append=position[-1:])
+    errors[:, 3, :3], errors[:, 4, :3] = _summed(-ways[:, 1:2] * heading), _summed(ways[:, :1] * heading)
+    errors[:, 6, :3], errors[:, 7, :3] = -velocity[:, 1:2] * heading, velocity[:, :1] * heading
+    turning = np.cross(rates[:, None], np.eye(3)).swapaxes(1, 2)
+    drift = _between((bodies @ turning) * common.lever, rest)
     # A path that is told its heights does not climb by it.
-    moving = moving.at[:, 2].multiply(jnp.where(common.height > 0.0, 0.0, 1.0))
-    drift = _between(moving, rest)
-    lever = zero, summed(drift * period[:, :, None]), jnp.concatenate([drift, drift[-1:]])
-    left = summed(jnp.where(rest, 0.0, 1.0)) > 0.0
-    height = jnp.zeros((count + 1, 9, 1)).at[:, 5, 0].set(jnp.where(left, common.height, 0.0))
-    return jnp.concatenate([*(jnp.concatenate(part, axis=1) for part in (offset, lever)), height], axis=2)
+    if common.height > 0:
+        drift[:, 2] = 0.0
+    errors[:, 3:6, 3:6], errors[:, 6:, 3:6] = _summed(drift * period), drift
+    errors[:, 5, 6] = np.where(np.cumsum(~rest) > 0, common.height, 0.0)
+    return errors
 
 
-def _between(values: Float[Array, "N 3 3"], rest: Bool[Array, "N"]) -> Float[Array, "N 3 3"]:
+def outer(errors: Float[np.ndarray, "N k m"]) -> Float[np.ndarray, "N k k"]:
+    """Their covariance."""
+    return errors @ errors.swapaxes(1, 2)
+
+
+def _summed(changes: Float[np.ndarray, "N *k"]) -> Float[np.ndarray, "N *k"]:
+    """At the start of each sample."""
+    return np.cumsum(changes, axis=0) - changes
+
+
+def _between(values: Float[np.ndarray, "N 3 3"], rest: Bool[np.ndarray, "N"]) -> Float[np.ndarray, "N 3 3"]:
     """Their mean over each rest, and straight lines between rests."""
-    here, last = jnp.arange(len(rest)), len(rest) - 1
-    number = jnp.cumsum(rest & ~jnp.concatenate([jnp.zeros(1, bool), rest[:-1]]))
-    weights = jnp.where(rest, 1.0, 0.0)[:, None, None]
-    total, count = (jnp.zeros_like(x).at[number].add(x) for x in (weights * values, weights))
-    means = (total / jnp.maximum(count, 1.0))[number]
-    before = jax.lax.cummax(jnp.where(rest, here, -1))
-    after = jax.lax.cummin(jnp.where(rest, here, last + 1), reverse=True)
-    share = (here - before) / jnp.maximum(after - before, 1)
-    # Before the first and after the last as there.
-    share = jnp.where(before < 0, 1.0, jnp.where(after > last, 0.0, share))[:, None, None]
-    return (1.0 - share) * means[jnp.maximum(before, 0)] + share * means[jnp.minimum(after, last)]
+    starts, ends = runs(rest)
+    total = np.concatenate([np.zeros((1, 9)), np.cumsum(values.reshape(-1, 9), axis=0)])
+    means = np.repeat((total[ends] - total[starts]) / (ends - starts)[:, None], 2, axis=0)
+    knots = np.stack([starts, ends - 1], axis=1).ravel()
+    lines = [np.interp(np.arange(len(rest)), knots, mean) for mean in means.T]
+    return np.stack(lines, axis=1).reshape(-1, 3, 3)
 
 
 def with_rests_in_doubt(trial: Trial, config: Config) -> Trial:

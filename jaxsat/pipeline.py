@@ -11,7 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsat.claims import Doubt, calibration_in_doubt, common_errors, doubt, with_rests_in_doubt
+from jaxsat.claims import (
+    Doubt,
+    calibration_in_doubt,
+    common_errors,
+    doubt,
+    outer,
+    with_rests_in_doubt,
+)
 from jaxsat.config import Config
 from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import Beside, computing, stored_jit
@@ -184,10 +191,12 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         grounded = sure.on_ground(ground.result())
         told = grounded.rows.height is not None and found.floor is None
         common = doubt(config, prepared.gyr_offset_sd, calibration, told)
-        covariance = _covariance(found, grounded, common)
+        n = len(recording)
+        states = [np.asarray(x)[:n] for x in (found.state.q_nb, found.state.position, found.state.velocity)]
+        rates = np.asarray(sure.signal)[:n, :3]
+        errors = beside.submit(common_errors, *states, rates, prepared.rest, recording.period, common)
+        covariance = np.asarray(_covariance(found, grounded))[:n] + outer(errors.result())
     clock.lap("smoother")
-
-    n = len(recording)
 
     def sampled(f):
         named = f.signal, f.variance, f.slack, f.sd, f.gap_sd, f.identified, f.at_bound, f.inflated
@@ -205,10 +214,10 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         config=config,
         trajectory=Trajectory(
             time=recording.time,
-            q_nb=np.asarray(found.state.q_nb)[:n],
-            position=np.asarray(found.state.position)[:n],
-            velocity=np.asarray(found.state.velocity)[:n],
-            covariance=np.asarray(covariance)[:n],
+            q_nb=states[0],
+            position=states[1],
+            velocity=states[2],
+            covariance=covariance,
         ),
         problem=sure,
         rails=prepared.rails,
@@ -246,34 +255,32 @@ def displacements(found: Estimate) -> tuple[Float[np.ndarray, "S 3"], Float[np.n
     position = found.trajectory.position
     way[whole] = position[ends[1]] - position[ends[0]]
     if whole.any() and found.problem.rows.height is None:
-        problem, size = found.problem, len(found.problem.period)
+        problem, size, known = found.problem, len(found.problem.period), found.trajectory
+        rates = np.asarray(problem.signal)[:n, :3]
+        given = known.q_nb, position, known.velocity, rates, found.rest, found.recording.period
+        # What is the same error everywhere is no part of what a motion's own rests tell of it.
+        own = known.covariance - outer(common_errors(*given, found.doubt))
+        # An offset turns a way and leaves it as long; a lever makes it longer, and climb where heights are not told.
+        errors = common_errors(*given, found.doubt._replace(height=np.zeros(())))
+        lever = (errors[ends[1]] - errors[ends[0]])[:, 3:6, 3:6]
         # Padding repeats the last motion.
         count = int(whole.sum())
         departure, arrival = np.pad(ends, ((0, 0), (0, bucket(count, 16) - count)), mode="edge")
-        known = found.trajectory
-        states = (pad(x, size) for x in (known.q_nb, known.velocity, position, known.covariance))
+        states = (pad(x, size) for x in (known.q_nb, known.velocity, position, own))
         with computing():
-            ways = _ways(problem, tuple(states), found.doubt, departure, arrival)
-        covariance[whole] = np.asarray(ways)[:count]
+            ways = _ways(problem, tuple(states), departure, arrival)
+        covariance[whole] = np.asarray(ways)[:count] + outer(lever)
     return way, covariance
 
 
 @stored_jit
-def _ways(problem: Trial, states, common: Doubt, departure, arrival):
+def _ways(problem: Trial, states, departure, arrival):
     samples = Samples(problem.signal, problem.period, problem.variance)
     *state, covariance = states
     start = NavState(*state)
-    # What is the same error everywhere is no part of what a motion's own rests tell of it.
-    given = start, problem.signal[:, :3], problem.period, problem.rows.rest
-    errors = common_errors(*given, common)
-    own = covariance - errors @ jnp.swapaxes(errors, 1, 2)
-    ways = displacement_covariance(
-        start, own, samples, problem.rows, problem.prior_covariance, departure, arrival
+    return displacement_covariance(
+        start, covariance, samples, problem.rows, problem.prior_covariance, departure, arrival
     )
-    # An offset turns a way and leaves it as long; a lever makes it longer, and climb where heights are not told.
-    free = common_errors(*given, common._replace(height=jnp.zeros(())))
-    lever = (free[arrival] - free[departure])[:, 3:6, 3:6]
-    return ways + lever @ jnp.swapaxes(lever, 1, 2)
 
 
 class _Clock:
@@ -315,23 +322,20 @@ def _path(trial: Trial, config: Config) -> Path:
     return jax.block_until_ready(found)
 
 
-def _covariance(path: Path, trial: Trial, common: Doubt) -> Float[Array, "N1 9 9"]:
-    """Of a path by the noise of `trial` and what is in doubt all through; rests that touch the floor still do."""
+def _covariance(path: Path, trial: Trial) -> Float[Array, "N1 9 9"]:
+    """Of a path by the noise of `trial`; rests that touch the floor still do."""
     touching = None if path.floor is None else path.floor.active
     given = path.state, trial.signal, trial.period, trial.variance, trial.rows, touching
-    known = trial.prior, trial.prior_covariance, trial.gravity
-    return jax.block_until_ready(_about(*given, *known, common))
+    return jax.block_until_ready(_about(*given, trial.prior, trial.prior_covariance, trial.gravity))
 
 
 @stored_jit
-def _about(state, signal, period, variance, rows, touching, prior, prior_covariance, gravity, common: Doubt):
-    errors = common_errors(state, signal[:, :3], period, rows.rest, common)
+def _about(state, signal, period, variance, rows, touching, prior, prior_covariance, gravity):
     if touching is not None:
         exact = jnp.zeros_like(rows.height_variance)
         rows = Rows(rows.rest, rows.velocity_variance, touching, exact, rows.velocity)
     samples = Samples(signal, period, variance)
-    covariance = smooth_about(state, samples, rows, prior, prior_covariance, gravity).covariance
-    return covariance + errors @ jnp.swapaxes(errors, 1, 2)
+    return smooth_about(state, samples, rows, prior, prior_covariance, gravity).covariance
 
 
 @stored_jit

@@ -42,8 +42,6 @@ from problems import (
 )
 
 from jaxsat import Sensor, load_config, simulate
-from jaxsat.claims import doubt
-from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import compiled, computing
 from jaxsat.inertial.smoother import smooth_about
 from jaxsat.pipeline import _covariance, _path, estimate
@@ -111,9 +109,8 @@ def estimate_vs_smoother() -> Iterator[Row]:
     with computing():
         prepared = prepare(recording, config)
         ground = find_ground(prepared, config)
-        common = doubt(config, prepared.gyr_offset_sd, Calibration.none(), heights=True)
         smoother, free = (
-            shortest(lambda trial=trial: _covariance(_path(trial, config), trial, common))
+            shortest(lambda trial=trial: _covariance(_path(trial, config), trial))
             for trial in (prepared.trial.on_ground(ground), prepared.trial)
         )
     seconds = shortest(lambda: estimate(recording, config).cost)

@@ -16,7 +16,6 @@ from jaxsat.config import load_config
 from jaxsat.demo import load_walk
 from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.programs import computing
-from jaxsat.inertial.strapdown import NavState
 from jaxsat.pipeline import _path, estimate
 from jaxsat.preparation import prepare
 from jaxsat.present.tables import segments_table
@@ -81,12 +80,10 @@ def test_a_rest_counts_once_in_each_time_that_its_velocity_stays_alike(walk):
 
 
 def errors_of(found, offset=0.0, lever=0.0, height=0.0):
-    problem, n, path = found.problem, len(found.recording), found.trajectory
-    with computing():
-        state = NavState(*map(jnp.asarray, (path.q_nb, path.velocity, path.position)))
-        given = (jnp.asarray(x)[:n] for x in (problem.signal[:, :3], problem.period, problem.rows.rest))
-        common = Doubt(*(jnp.asarray(np.broadcast_to(x, 3)) for x in (offset, lever)), jnp.asarray(height))
-        return np.asarray(common_errors(state, *given, common))
+    path, rates = found.trajectory, np.asarray(found.problem.signal)[: len(found.recording), :3]
+    common = Doubt(*(np.broadcast_to(np.asarray(x, float), 3) for x in (offset, lever)), np.asarray(height))
+    given = path.q_nb, path.position, path.velocity, rates, found.rest, found.recording.period
+    return common_errors(*given, common)
 
 
 def test_an_offset_turns_the_way_as_its_sd_says(walk):
