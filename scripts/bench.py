@@ -110,12 +110,12 @@ def estimate_vs_smoother() -> Iterator[Row]:
         prepared = prepare(recording, config)
         ground = find_ground(prepared, config)
         smoother, free = (
-            shortest(lambda trial=trial: _covariance(_path(trial, config), trial))
+            shortest(lambda trial=trial: _covariance(_path(trial, config), trial), 20)
             for trial in (prepared.trial.on_ground(ground), prepared.trial)
         )
-    seconds = shortest(lambda: estimate(recording, config).cost)
+    seconds = shortest(lambda: estimate(recording, config).cost, 20)
     plain = load_config(None, method="standard")
-    standard = shortest(lambda: estimate(recording, plain).cost)
+    standard = shortest(lambda: estimate(recording, plain).cost, 20)
     busy = int((found.fills.status != 2).sum())
     yield Row(
         "estimate_vs_smoother", seconds / smoother, "1", "lower", 3, None,
