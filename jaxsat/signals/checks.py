@@ -183,7 +183,7 @@ def spurious_accelerations(
     A wrong scale tilts gravity into it: `scales` compare units, and rates too, as an angle is rate × period.
     """
     size = max(1, int(COARSE / recording.period))
-    still = _blocks(still, size).all(axis=1)
+    still = np.asarray(_blocks(still, size).all(axis=1))
     turns = _blocks(recording.gyr * recording.period, size).sum(axis=1)
     acc = _blocks(recording.acc, size).mean(axis=1)
     n = max(3, round(STILL_WINDOW / (recording.period * size)))
