@@ -155,7 +155,7 @@ def test_an_offset_that_is_not_asked_for_is_not_in_doubt(walk):
 
 
 def test_strides_lie_in_their_intervals(walk, found, intervals):
-    """Of 31 strides, by motion capture: 58 and 87 % of the lengths, 29 and 65 % if a rest tells its velocity anew
+    """Of 31 strides, by motion capture: 58 and 90 % of the lengths, 29 and 65 % if a rest tells its velocity anew
     with each sample."""
     recording, truth = walk
     path = found[1].trajectory
@@ -168,4 +168,4 @@ def test_strides_lie_in_their_intervals(walk, found, intervals):
     assert steady["count"] == 31
     assert steady["within_50"] > 0.45 and 0.85 < steady["within_90"] < 1.0
     assert white["within_50"] < 0.4 and white["within_90"] < 0.75
-    assert held[0].loc["climbs", "within_90"] < 0.4 and held[1].loc["climbs", "within_90"] > 0.6
+    assert held[1].loc["climbs", "within_90"] >= 2 * held[0].loc["climbs", "within_90"]
