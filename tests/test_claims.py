@@ -34,9 +34,9 @@ def walk():
 
 @pytest.fixture(scope="module")
 def found(walk):
-    """With velocities of rests that are white, as the path has them, and as they are by default."""
-    white = {"noise.rest_steady": 0.0}
-    return [estimate(walk[0], load_config(None, method="standard", **given)) for given in (white, {})]
+    """With velocities of rests that are white, as the path has them, as by default, and alike for half a second."""
+    settings = {"noise.rest_steady": 0.0}, {}, {"noise.rest_steady": 0.5}
+    return [estimate(walk[0], load_config(None, method="standard", **given)) for given in settings]
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +48,8 @@ def intervals():
         sys.path.remove(str(SCRIPTS))
 
 
-def test_claims_are_wider_and_paths_the_same(walk, found):
-    white = found[0]
-    half = {"noise.rest_steady": 0.5}
-    steady = estimate(walk[0], load_config(None, method="standard", **half))
+def test_claims_are_wider_and_paths_the_same(found):
+    white, _, steady = found
     np.testing.assert_array_equal(steady.trajectory.position, white.trajectory.position)
     np.testing.assert_array_equal(steady.trajectory.q_nb, white.trajectory.q_nb)
     np.testing.assert_array_equal(steady.calibration.constants, white.calibration.constants)
@@ -97,7 +95,7 @@ def test_an_offset_turns_the_way_as_its_sd_says(walk):
         off = estimate(recording.with_signal(recording.signal + np.append(offset, np.zeros(3))), config)
         turned = (Rotation.from_quat(np.roll(off.trajectory.q_nb, -1, axis=1)) * before.inv()).as_rotvec()
         error = errors_of(plain, offset)[:, :, axis]
-        np.testing.assert_allclose(turned[:, 2], error[:, 2], atol=5e-4)
+        np.testing.assert_allclose(turned[:, 2], error[:, 2], atol=2e-4)
         moved = off.trajectory.position - plain.trajectory.position
         np.testing.assert_allclose(moved, error[:, 3:6], atol=0.01)
         # About the vertical they turn by far more.
@@ -164,8 +162,9 @@ def test_strides_lie_in_their_intervals(walk, found, intervals):
         intervals.summary(pd.DataFrame(intervals.path_held("walk", one, truth, point))).set_index("what")
         for one in found
     ]
-    white, steady = (one.loc["lengths"] for one in held)
+    white, steady, _ = (one.loc["lengths"] for one in held)
     assert steady["count"] == 31
     assert steady["within_50"] > 0.45 and 0.85 < steady["within_90"] < 1.0
     assert white["within_50"] < 0.4 and white["within_90"] < 0.75
-    assert held[1].loc["climbs", "within_90"] >= 2 * held[0].loc["climbs", "within_90"]
+    white, steady, half = (one.loc["climbs", "within_90"] for one in held)
+    assert half > 2 * white and steady > white + 0.3
