@@ -31,7 +31,7 @@ from jaxsat.inertial.smoother import (
     smooth_nonnegative,
 )
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.preparation import calibrate_by_rests, constants_sd, find_ground, prepare
+from jaxsat.preparation import constants_sd, find_ground, prepare
 from jaxsat.saturation.compensate import (
     Fills,
     compensate_parallel,
@@ -125,8 +125,8 @@ def search_options(config: Config, method: str) -> Options:
         cast(Compensation, method),
         chosen.solver,
         chosen.free_peak_time,
-        jnp.asarray(chosen.max_iterations),
-        jnp.asarray(chosen.tolerance),
+        np.asarray(chosen.max_iterations),
+        np.asarray(chosen.tolerance),
         constants_sd(config),
         prior_scales(config),
     )
@@ -134,7 +134,7 @@ def search_options(config: Config, method: str) -> Options:
 
 def prior_scales(config: Config) -> Scales:
     chosen = config.saturation
-    return Scales(jnp.asarray(chosen.prior_width, float), jnp.asarray(chosen.prior_share, float))
+    return Scales(np.asarray(chosen.prior_width, float), np.asarray(chosen.prior_share, float))
 
 
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:
@@ -146,17 +146,13 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     options = None
     if config.method != "standard" and len(gaps):
         options = search_options(config, config.method)
+    fills, calibration = None, prepared.calibration
     # What the search does not wait for goes on beside it.
     with Beside(2) as beside:
         programs = trace_search(trial, segments, options, together=together) if options else []
         compiling = [beside.submit(program) for program in programs]
         learning = beside.submit(learn_prior, trial, options) if options else None
-        calibration = calibrate_by_rests(trial, config)
-        clock.lap("calibration")
-        sure = trial.calibrated(calibration)
-        ground = beside.submit(find_ground, prepared, config, calibration)
-        ignoring = beside.submit(lambda trial: _path(trial.on_ground(ground.result()), config), sure)
-        fills, compensated = None, None
+        grounding = beside.submit(find_ground, prepared, config)
         if options is not None and learning is not None:
 
             def learned(prior=learning):
@@ -172,30 +168,35 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
             else:
                 fills, calibration = compensate_sequential(*given, report)
             clock.lap("compensation")
-        taken = fills or Fills.nothing(trial, len(segments))
-        doubted = beside.submit(
+        ground = grounding.result()
+    taken = fills or Fills.nothing(trial, len(segments))
+    # One thread beside this one: what is waited for first comes first.
+    with Beside(1) as beside:
+        doubting = beside.submit(
             calibration_in_doubt, trial, config, calibration, taken.signal, taken.variance
         )
+        path = sure = ignoring = trial.calibrated(prepared.calibration)
         if fills is not None:
             filled = eqx.tree_at(lambda t: t.signal, trial, fills.signal).calibrated(calibration)
             path, sure = (
                 eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
                 for extra in (fills.slack, fills.variance)
             )
-            compensated = _path(path.on_ground(ground.result()), config)
-        standard = ignoring.result()
-        found = compensated or standard
-        calibration = doubted.result()
+        standing = beside.submit(_path, ignoring.on_ground(ground), config) if fills is not None else None
+        found = _path(path.on_ground(ground), config)
+        calibration = doubting.result()
         # How sure the path is, is another question.
         sure = with_rests_in_doubt(sure, config)
-        grounded = sure.on_ground(ground.result())
+        grounded = sure.on_ground(ground)
         told = grounded.rows.height is not None and found.floor is None
         common = doubt(config, prepared.gyr_offset_sd, calibration, told)
         n = len(recording)
         states = [np.asarray(x)[:n] for x in (found.state.q_nb, found.state.position, found.state.velocity)]
         rates = np.asarray(sure.signal)[:n, :3]
-        errors = beside.submit(common_errors, *states, rates, prepared.rest, recording.period, common)
-        covariance = np.asarray(_covariance(found, grounded))[:n] + outer(errors.result())
+        given = *states, rates, prepared.rest, recording.period, common
+        errors = beside.submit(lambda: outer(common_errors(*given)))
+        covariance = np.asarray(_covariance(found, grounded))[:n] + errors.result()
+        standard = found if standing is None else standing.result()
     clock.lap("smoother")
 
     def sampled(f):
@@ -233,7 +234,7 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         cost=np.asarray(found.cost),
         cost_standard=np.asarray(standard.cost),
         gravity=float(trial.gravity),
-        level=config.height.mode == "auto" and ground.result() is not None,
+        level=config.height.mode == "auto" and ground is not None,
         gyr_offset=prepared.gyr_offset,
         doubt=common,
         floor=floor,

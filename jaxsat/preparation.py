@@ -10,7 +10,7 @@ from jaxsat.config import Config
 from jaxsat.errors import InputError
 from jaxsat.inertial.calibration import Calibration
 from jaxsat.inertial.orientation import Gains, Start, backward
-from jaxsat.inertial.programs import computing, make_room, stored_jit
+from jaxsat.inertial.programs import Beside, computing, make_room, stored_jit
 from jaxsat.inertial.rotations import quat_between, quat_conjugate, quat_multiply
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import NavState, prefixes, sample_intervals
@@ -18,7 +18,7 @@ from jaxsat.saturation.compensate import FIRST_STEPS, calibrate_recording, filte
 from jaxsat.saturation.false_rests import false_rests
 from jaxsat.saturation.layout import Trial, pad
 from jaxsat.saturation.level_ground import ROW, is_level
-from jaxsat.signals.checks import check
+from jaxsat.signals.checks import check, check_form
 from jaxsat.signals.rails import Gaps, Rails, find_gaps, find_rails, saturation_mask
 from jaxsat.signals.recording import Recording, sensor_changes
 from jaxsat.signals.rests import Segments, find_rests, find_segments, resting_rate
@@ -45,6 +45,8 @@ class Prepared(eqx.Module):
     """What was taken off the rates (rad/s)."""
     gyr_offset_sd: Float[np.ndarray, "3"]
     """How well that is known (rad/s); zero where none was asked for."""
+    calibration: Calibration
+    """What the rests tell; what saturates may be anything within its bounds."""
     rails: Rails
     rest: Bool[np.ndarray, "N"]
     segments: Segments
@@ -61,65 +63,77 @@ def prepare(recording: Recording, config: Config) -> Prepared:
 
 def _prepare(recording: Recording, config: Config) -> Prepared:
     make_room()
-    warnings = check(recording)
-    rails = find_rails(recording, config.rails.gyr, config.rails.acc)
-    saturated, sign = saturation_mask(recording, rails)
-    at_rail = np.any(saturated, axis=1)
-    rest = find_rests(
-        recording,
-        config.rests.detector,
-        config.rests.threshold,
-        config.rests.window,
-        config.rests.min_duration,
-        at_rail,
-    )
-    rest = rest & ~at_rail & ~recording.missing.all(axis=1)
-    while True:
-        trial, (offset, offset_sd), grounded = _trial(recording, config, rest, sign)
-        segments = find_segments(rest)
-        # Saturated values may be anything within their bounds here.
-        filtered = filter_recording(trial, trial.signal, trial.unfilled_variance)
-        false = false_rests(trial, segments, filtered)
-        if not false.any():
-            break
-        for start, end in zip(segments.arrival[false], segments.rest_end[false], strict=True):
-            rest[start:end] = False
-            warnings.append(
-                f"the rest from {recording.time[start]:.2f} to {recording.time[end]:.2f} s is left out: the motions "
-                "before and after it say that the sensor moved."
-            )
+    check_form(recording)
+    left_out = []
+    with Beside(1) as beside:
+        try:
+            rails = find_rails(recording, config.rails.gyr, config.rails.acc)
+            saturated, sign = saturation_mask(recording, rails)
+            rest = _rests(recording, config, np.any(saturated, axis=1))
+            while True:
+                trial, offset, grounded = _trial(recording, config, rest, sign)
+                calibrating = beside.submit(_calibrate_by_rests, trial, config)
+                segments = find_segments(rest)
+                # Saturated values may be anything within their bounds here.
+                filtered = filter_recording(trial, trial.signal, trial.unfilled_variance)
+                false = false_rests(trial, segments, filtered)
+                if not false.any():
+                    break
+                for start, end in zip(segments.arrival[false], segments.rest_end[false], strict=True):
+                    rest[start:end] = False
+                    left_out.append(
+                        f"the rest from {recording.time[start]:.2f} to {recording.time[end]:.2f} s is left out: the "
+                        "motions before and after it say that the sensor moved."
+                    )
+        finally:
+            # Here it goes on beside the calibration; what makes no sense says so, not what came of it.
+            warnings = check(recording)
+        calibration = calibrating.result()
     return Prepared(
-        trial, grounded, offset, offset_sd, rails, rest, segments, find_gaps(sign), sign, warnings
+        trial=trial,
+        grounded=grounded,
+        gyr_offset=offset[0],
+        gyr_offset_sd=offset[1],
+        calibration=calibration,
+        rails=rails,
+        rest=rest,
+        segments=segments,
+        gaps=find_gaps(sign),
+        sign=sign,
+        warnings=[*warnings, *left_out],
     )
 
 
-def constants_sd(config: Config) -> Float[Array, "9"] | None:
+def _rests(recording: Recording, config: Config, at_rail: Bool[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+    chosen = config.rests
+    rest = find_rests(
+        recording, chosen.detector, chosen.threshold, chosen.window, chosen.min_duration, at_rail
+    )
+    return rest & ~at_rail & ~recording.missing.all(axis=1)
+
+
+def constants_sd(config: Config) -> Float[np.ndarray, "9"] | None:
     """None where no constant is wanted."""
     sd = config.smoother.constants_sd
-    return jnp.asarray(sd) if any(sd) else None
+    return np.asarray(sd) if any(sd) else None
 
 
-def calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
-    """The constants that the rests of a recording tell; what saturates may be anything within its bounds."""
+def _calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
     sd, found = constants_sd(config), Calibration.none()
     for _ in range(FIRST_STEPS if sd is not None else 0):
         found = calibrate_recording(trial, trial.signal, trial.unfilled_variance, sd, found)
     return found
 
 
-def find_ground(
-    prepared: Prepared, config: Config, calibration: Calibration | None = None
-) -> Bool[np.ndarray, "P"] | None:
+def find_ground(prepared: Prepared, config: Config) -> Bool[np.ndarray, "P"] | None:
     """First samples of the rests whose height the whole path is told; the search for δ does without.
 
-    With `height.mode = "auto"` None unless the ground is level. calibration: default `calibrate_by_rests`. To be
-    called within `computing`.
+    With `height.mode = "auto"` None unless the ground is level. To be called within `computing`.
     """
     trial, grounded = prepared.trial, prepared.grounded
     if config.height.mode != "auto" or grounded is None:
         return grounded
-    known = calibrate_by_rests(trial, config) if calibration is None else calibration
-    return grounded if is_level(trial.calibrated(known), grounded) else None
+    return grounded if is_level(trial.calibrated(prepared.calibration), grounded) else None
 
 
 def _trial(
@@ -154,8 +168,8 @@ def _trial(
 
     # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
     # controller of `orientation` where that is so long that its offset would do more than the controller errs.
-    q_nb = quat_between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
-    velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
+    q_nb = _between(up, np.array([0.0, 0.0, 1.0]))
+    velocity, tilt = np.zeros(3), noise.initial_tilt_sd**2
     drifted = (LEFT_OFFSET_SD * first * T) ** 2 + density[:3].max() ** 2 * first * T
     if first * T > LATEST_FIRST_REST:
         tilt += min(drifted, MOVING_START_TILT_SD**2)
@@ -174,11 +188,11 @@ def _trial(
     arrived = np.concatenate([[False], rest[1:] & ~rest[:-1]]) & (np.arange(n) > first)
     mode = config.height.mode
     rows = Rows(
-        rest=jnp.asarray(rest),
-        velocity_variance=jnp.full(n, noise.rest_velocity_sd**2),
-        height=jnp.asarray(arrived) if mode == "zero" else None,
-        height_variance=jnp.full(n, config.height.sd**2),
-        velocity=jnp.zeros((n, 3)),
+        rest=rest,
+        velocity_variance=np.full(n, noise.rest_velocity_sd**2),
+        height=arrived if mode == "zero" else None,
+        height_variance=np.full(n, config.height.sd**2),
+        velocity=np.zeros((n, 3)),
     )
     trial = Trial(
         signal=signal,
@@ -194,6 +208,9 @@ def _trial(
     ).padded()
     asked = mode == "nonnegative" or (mode == "auto" and arrived.sum() >= ROW)
     return trial, offset, pad(arrived, len(trial.signal)) if asked else None
+
+
+_between = stored_jit(quat_between)
 
 
 def _attitude_before(signal, trusted, period: float, rest: Start, config: Config) -> Float[Array, "4"]:

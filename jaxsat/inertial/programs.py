@@ -10,6 +10,7 @@ import pickle
 import platform
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -35,11 +36,13 @@ OPTIONS: Options = {"xla_cpu_use_fusion_emitters": False} if version("jaxlib").s
 # For what runs for a moment and is compiled for long: without LLVM's optimisations.
 UNOPTIMISED: Options = {**OPTIONS, "xla_backend_optimization_level": 0}
 
-# Of the memory maps that Linux allows a process so many may be taken before compiled programs are forgotten.
-MOST_MAPS = 0.5
+# Of the memory maps that Linux allows a process so many may be taken before compiled programs are forgotten. They are
+# counted so often (s), which takes 2 ms; in a second a few dozen programs are compiled at most.
+MOST_MAPS, COUNTED_EVERY = 0.5, 1.0
 
 _folder: Path | None = None
 _loaded: dict[Hashable, "_Program | None"] = {}
+_counted = -np.inf
 
 
 @contextmanager
@@ -104,6 +107,10 @@ def make_room() -> None:
     On a CPU each takes hundreds of memory maps, and a process that has no more of them dies in the next compilation
     (jaxlib 0.10, some 100 programs). What is needed again comes from JAX's cache on disk, if there is one.
     """
+    global _counted
+    if time.monotonic() - _counted < COUNTED_EVERY:
+        return
+    _counted = time.monotonic()
     try:
         taken = Path("/proc/self/maps").read_bytes().count(b"\n")
         most = int(Path("/proc/sys/vm/max_map_count").read_text())

@@ -78,11 +78,11 @@ class Fills(eqx.Module):
 
     @staticmethod
     def nothing(trial: Trial, count: int) -> "Fills":
-        zeros, shape = np.zeros(count), trial.signal.shape
+        zeros, shape, unfilled = np.zeros(count), trial.signal.shape, np.asarray(trial.unfilled_variance)
         return Fills(
             signal=np.array(trial.signal),
-            variance=np.array(trial.unfilled_variance),
-            slack=np.array(trial.unfilled_variance),
+            variance=unfilled.copy(),
+            slack=unfilled.copy(),
             sd=np.zeros(shape),
             gap_sd=np.full(shape, np.nan),
             identified=np.full(shape, np.nan),
@@ -202,12 +202,26 @@ def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 1
     # A segment without a departure has no known start, so its arrival tells nothing about it.
     length = np.where(segments.departure >= 0, segments.rest_end - segments.arrival, 0)
     table = np.zeros((len(segments), 10, 10))
-    # Rests of like length side by side: all wait for the longest.
-    for mine in _evenly(np.argsort(length), 2 * LANES):
+    for mine in _alike(np.argsort(length), length):
         lanes = _lanes(len(mine))
         start, steps = pad(segments.arrival[mine], lanes), pad(length[mine], lanes)
         table[mine] = np.asarray(_arrivals(trial, start, start + steps, steps.max()))[: len(mine)]
     return table
+
+
+def _alike(order: Int[np.ndarray, "S"], length: Int[np.ndarray, "S"]) -> Iterator[Int[np.ndarray, "L"]]:
+    """Rests of like length side by side: all wait for the longest, so a few that are long go apart.
+
+    order: by length.
+    """
+
+    def cost(part):
+        # A step takes as long as 6 lanes of it, on a CPU.
+        return length[part[-1]] * (6 + _lanes(len(part))) if len(part) else 0
+
+    for part in _evenly(order, 2 * LANES):
+        ways = [np.split(part, [len(part) - apart]) for apart in (0, 1, 4, 8, 16) if apart <= len(part)]
+        yield from (some for some in min(ways, key=lambda way: sum(map(cost, way))) if len(some))
 
 
 def _evenly(indices: Int[np.ndarray, "S"], most: int) -> list[Int[np.ndarray, "L"]]:

@@ -31,7 +31,7 @@ from jaxsat.inertial.strapdown import (
     sample_intervals,
     sample_noise,
 )
-from jaxsat.preparation import calibrate_by_rests, find_ground, prepare
+from jaxsat.preparation import find_ground, prepare
 from jaxsat.saturation.layout import Trial, pad
 from jaxsat.signals.recording import Recording
 from jaxsat.studies.metrics import Track
@@ -150,10 +150,9 @@ def noise_trial(recording: Recording, config: Config, truth: Track | None = None
     """
     with computing():
         prepared = prepare(recording, config)
-        known = calibrate_by_rests(prepared.trial, config)
         # The likelihood is that of velocities; a position has the height that the estimate gives it.
-        ground = find_ground(prepared, config, known) if truth is not None else None
-        trial = jax.tree.map(np.asarray, prepared.trial.calibrated(known).on_ground(ground))
+        ground = find_ground(prepared, config) if truth is not None else None
+        trial = jax.tree.map(np.asarray, prepared.trial.calibrated(prepared.calibration).on_ground(ground))
     n, size = len(recording), len(prepared.trial.signal)
     extra = prepared.trial.variance[:n] - np.array(config.noise.densities) ** 2 / recording.period
     made = NoiseTrial(
