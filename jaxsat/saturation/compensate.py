@@ -141,6 +141,7 @@ def filter_trial(trial: Trial, signal: Float[Arrays, "N 6"], extra: Float[Arrays
 
 def solve_segments(
     trial: Trial,
+    filled: Float[Arrays, "N 6"],
     states: NavState,
     covariances: Float[Arrays, "L s s"],
     table: Float[Arrays, "L 10 10"],
@@ -152,11 +153,11 @@ def solve_segments(
 ) -> tuple[SegmentFill, Values]:
     """Some segments of a recording side by side, from the filtered states at their departures.
 
-    prior: what `signal_prior` says; None for methods other than `map`.
+    filled: the signal to begin with, `trial.signal` for none; prior: what `signal_prior` says; None for methods other than `map`.
     """
 
     def solve(state, covariance, table, departure, arrival):
-        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior)
+        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior, filled)
         return solve_segment(segment, jnp.asarray(trial.gravity), options), values
 
     return jax.vmap(solve)(states, covariances, table, departure, arrival)
@@ -235,14 +236,14 @@ def _lanes(count: int) -> int:
 
 
 def _solve_some(
-    calibrated: Trial, departures, table, segments: Segments, prior, options, chunk
+    calibrated: Trial, filled, departures, table, segments: Segments, prior, options, chunk
 ) -> tuple[SegmentFill, Values]:
     """Solve some segments, of `solved_together`, padded to a number of lanes; departures, table: of all segments."""
     mine, sizes = chunk
     lanes = _lanes(len(mine))
     given = (departures, table, segments.departure, segments.arrival)
     (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x[mine], lanes), given)
-    found = _solve(calibrated, states, covariances, table, departure, arrival, prior, sizes, options)
+    found = _solve(calibrated, filled, states, covariances, table, departure, arrival, prior, sizes, options)
     return jax.block_until_ready(found)
 
 
@@ -260,7 +261,7 @@ def trace_search(
         lane = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)
         lane = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), lane)
         if len(mine) and (lanes, sizes) not in programs:
-            programs[lanes, sizes] = trace_ahead(_solve, here, *lane, prior, sizes, options)
+            programs[lanes, sizes] = trace_ahead(_solve, here, trial.signal, *lane, prior, sizes, options)
     return list(programs.values())
 
 
@@ -298,7 +299,7 @@ def compensate_parallel(
             departures = jax.tree.map(lambda x: np.asarray(x)[first], (filtered.state, filtered.covariance))
             if sweep == 0:
                 prior = learned()
-            solve = partial(_solve_some, here, departures, arriving.result(), segments, prior, options)
+            solve = partial(_solve_some, here, filled, departures, arriving.result(), segments, prior, options)
             for (mine, _), found in zip(chunks, beside.map(solve, chunks), strict=True):
                 fills.record(trial, mine, *found)
                 done += len(mine)
@@ -368,7 +369,7 @@ def compensate_sequential(
         at = departure
         departures = jax.tree.map(lambda x: np.stack([x] * len(segments)), (state, covariance))
         mine = np.array([index])
-        found = _solve_some(here, departures, table, segments, prior, options, (mine, sizes))
+        found = _solve_some(here, fills.signal - bias, departures, table, segments, prior, options, (mine, sizes))
         fills.record(trial, mine, *found)
         if progress:
             progress(count + 1, len(busy))

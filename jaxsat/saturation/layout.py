@@ -123,10 +123,12 @@ def gather(
     table: Float[Array, "10 10"],
     sizes: Sizes,
     prior: SignalPrior | None = None,
+    filled: Float[Array, "N 6"] | None = None,
 ) -> tuple[Segment, Values]:
     """One segment, padded; [departure, arrival) are its samples.
 
-    state, covariance: of the filter at departure; table: Λ of the arrival; prior: of the signal, for `map`.
+    state, covariance: of the filter at departure; table: Λ of the arrival; prior: of the signal, for `map`; filled: the
+    signal to begin with, as measured if it is not given.
     """
     n, m = sizes
     count = len(trial.signal)
@@ -157,6 +159,9 @@ def gather(
         variance, covariance, height_variance = (noise * x for x in (variance, covariance, height_variance))
         table = table / noise
         known = of_values(prior, jnp.asarray(trial.signal), start + sample, channel, way, gap)
+    begin = jnp.zeros(m, signal.dtype)
+    if filled is not None:
+        begin = way * (jnp.asarray(filled)[start + sample, channel] - signal[sample, channel])
     segment = Segment(
         signal=signal,
         period=window(trial.period),
@@ -167,6 +172,7 @@ def gather(
         channel=channel,
         sign=way,
         bound=jnp.where(valid, jnp.asarray(trial.bound)[channel], 0.0),
+        start=begin,
         gap=gap,
         edges=edges,
         departure=state,

@@ -35,19 +35,21 @@ class Search(eqx.Module):
 
 
 def search_space(method: Compensation, segment: Segment, free_peak_time: bool = False) -> Search:
-    """Method 1 (`direct`) searches every δ from 0; method 2 the height of each gap, from half of its range.
+    """Method 1 (`direct`) searches every δ; method 2 the height of each gap, from half of its range.
 
-    `map` searches every δ from where the signal prior alone puts it, but for those of gaps that are not to be filled.
+    `map` searches every δ but for those of gaps that are not to be filled. Both begin at `Segment.start`; where that is
+    nothing, `map` does where the signal prior alone puts it.
     free_peak_time: method 2 also searches where in the gap the peak lies, instead of fixing it by Eq. 21.
     """
     if method == "map":
         assert segment.known is not None, "the signal prior was gathered"
         nothing = jnp.zeros_like(segment.bound)
         upper = jnp.where(segment.known.harmful, 0.0, segment.bound)
-        start = dense_box_step(segment.known.slope, segment.known.precision, nothing, upper)
-        return Search(lambda delta: delta, upper, start)
+        new = ~jnp.any(segment.start > 0.0)
+        prior = dense_box_step(segment.known.slope, segment.known.precision, nothing, upper, new)
+        return Search(lambda delta: delta, upper, jnp.where(new, prior, jnp.clip(segment.start, 0.0, upper)))
     if method == "direct":
-        return Search(lambda delta: delta, segment.bound, jnp.zeros_like(segment.bound))
+        return Search(lambda delta: delta, segment.bound, jnp.clip(segment.start, 0.0, segment.bound))
     edges = segment.edges
     gap_bound = jnp.zeros_like(edges.rail).at[segment.gap].max(segment.bound)
     top = peak(edges, edges.rail + gap_bound)
@@ -126,7 +128,7 @@ def solve_segment(segment: Segment, gravity: Float[Array, ""], options: Options)
             value, gradient = value + delta @ (known.slope + 0.5 * pull), gradient + known.slope + pull
         return value, *jax.tree.map(lambda x: back(x)[0], (gradient, columns))
 
-    # f(0), and the curvature at the start, of `direct` the same point; both from one compiled evaluation.
+    # f(0), and the curvature at the start, of `direct` at 0 too; both from one compiled evaluation.
     first, back = jax.vjp(search.delta, search.start)
     points = jnp.stack([jnp.zeros_like(first), first][: 1 if options.method == "direct" else 2])
     values, columns, effects = jax.lax.map(lambda delta: value_and_root(delta, condensed, gravity), points)

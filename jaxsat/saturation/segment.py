@@ -52,6 +52,8 @@ class Segment(eqx.Module):
     """Direction of the rail: the true value is signal + sign·δ with 0 ≤ δ ≤ bound; zero pads."""
     bound: Float[Array, "m"]
     """δ_b (rad/s or m/s²)."""
+    start: Float[Array, "m"]
+    """δ to begin with; zeros where nothing better is known."""
     gap: Int[Array, "m"]
     """Which of the segment's gaps a saturated value belongs to."""
     edges: Edges

@@ -327,12 +327,12 @@ def score(
 
         def once(before, _, option=option):
             filled, extra, _, calibration, prior = before
-            here = trial.calibrated(calibration)
-            filtered = filter_trial(here, filled - calibration.constants[None, :6], extra)
+            here, filled = trial.calibrated(calibration), filled - calibration.constants[None, :6]
+            filtered = filter_trial(here, filled, extra)
             states, covariances, _ = jax.tree.map(lambda x: x[at], filtered)
             table = _table(case, here) if bare is None else bare
             fill, values = solve_segments(
-                here, states, covariances, table, case.departure, case.arrival, prior, sizes, option
+                here, filled, states, covariances, table, case.departure, case.arrival, prior, sizes, option
             )
             place = (values.sample, values.channel)
             way = sign.at[place].get(mode="fill", fill_value=0)
