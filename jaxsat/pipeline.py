@@ -172,9 +172,6 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
     taken = fills or Fills.nothing(trial, len(segments))
     # One thread beside this one: what is waited for first comes first.
     with Beside(1) as beside:
-        doubting = beside.submit(
-            calibration_in_doubt, trial, config, calibration, taken.signal, taken.variance
-        )
         path = sure = ignoring = trial.calibrated(prepared.calibration)
         if fills is not None:
             filled = eqx.tree_at(lambda t: t.signal, trial, fills.signal).calibrated(calibration)
@@ -182,8 +179,11 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 eqx.tree_at(lambda t: t.variance, filled, trial.variance + extra)
                 for extra in (fills.slack, fills.variance)
             )
-        standing = beside.submit(_path, ignoring.on_ground(ground), config) if fills is not None else None
-        found = _path(path.on_ground(ground), config)
+        path, ignoring = path.on_ground(ground), ignoring.on_ground(ground)
+        found_from = trial, config, calibration, taken.signal, taken.variance
+        doubting = beside.submit(calibration_in_doubt, *found_from)
+        standing = None if fills is None else beside.submit(_path, ignoring, config)
+        found = _path(path, config)
         calibration = doubting.result()
         # How sure the path is, is another question.
         sure = with_rests_in_doubt(sure, config)

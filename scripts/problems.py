@@ -124,7 +124,16 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
     filtered = filter_trial(first, first.signal, jnp.where(sure, 0.0, first.unfilled_variance))
     state, covariance, _ = jax.tree.map(lambda x: x[batch.departure], filtered)
     return solve_segments(
-        trial, trial.signal, state, covariance, table, batch.departure, batch.arrival, None, batch.sizes, options
+        trial,
+        trial.signal,
+        state,
+        covariance,
+        table,
+        batch.departure,
+        batch.arrival,
+        None,
+        batch.sizes,
+        options,
     )
 
 

@@ -18,7 +18,8 @@ from jaxsat.preparation import LATEST_FIRST_REST
 from jaxsat.present.summary import summarise
 from jaxsat.present.tables import gaps_table
 from jaxsat.saturation import compensate
-from jaxsat.saturation.compensate import ENTRIES, LANES, signal_prior, solved_together
+from jaxsat.saturation.compensate import ENTRIES, signal_prior, solved_together
+from jaxsat.saturation.layout import LANES
 from jaxsat.signals.readers import read
 from jaxsat.studies.metrics import load_pyshoe_truth, position_rmse
 from jaxsat.studies.motions import Bar, Walk

@@ -36,6 +36,7 @@ def build(height: bool, departure=None) -> Segment:
         channel=jnp.array([*CHANNEL, 0, 0]),
         sign=jnp.array([1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 0.0, 0.0]),
         bound=jnp.array([5.0] * 6 + [0.0] * 2),
+        start=jnp.zeros(8),
         gap=jnp.zeros(8, int),
         edges=Edges(*[no_gap] * 7, sound=no_gap > 0),
         departure=state,

@@ -4,15 +4,20 @@ In the body frame at arrival the rest samples do not depend on δ; the velocity 
 do. With m = [θ, v̂ + v_e] and γ = [g; 1] in that frame the rows of the rest cost ½ [m; γ]ᵀ Λ [m; γ].
 """
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsat.inertial.dense import eigh
+from jaxsat.inertial.programs import stored_jit
 from jaxsat.inertial.rotations import quat_multiply, quat_rotate, skew
 from jaxsat.inertial.smoother import Rows
 from jaxsat.inertial.strapdown import Samples, sample_interval, sample_noise
+from jaxsat.saturation.layout import LANES, Trial, evenly, pad, padded_lanes
+from jaxsat.signals.rests import Segments
 
 # Position is not seen by a velocity row, so the arrival speaks of [θ, v] only.
 _SEEN = np.array([0, 1, 2, 6, 7, 8])
@@ -67,6 +72,38 @@ def arrivals(
     blank = (jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.eye(6, 10), jnp.zeros((6, 6)), jnp.zeros((10, 10)))
     lanes = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(start), *x.shape)), blank)
     return jax.lax.fori_loop(0, longest, lambda k, c: jax.vmap(one)(c, start + k, end), lanes)[3]
+
+
+@stored_jit
+def _arrivals(trial: Trial, start, end, longest):
+    return arrivals(Samples(trial.signal, trial.period, trial.variance), trial.rows, start, end, longest)
+
+
+def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 10"]:
+    """Λ of every segment's arrival; zeros where no rest follows. Independent of δ: rests do not saturate."""
+    # A segment without a departure has no known start, so its arrival tells nothing about it.
+    length = np.where(segments.departure >= 0, segments.rest_end - segments.arrival, 0)
+    table = np.zeros((len(segments), 10, 10))
+    for mine in _alike(np.argsort(length), length):
+        lanes = padded_lanes(len(mine))
+        start, steps = pad(segments.arrival[mine], lanes), pad(length[mine], lanes)
+        table[mine] = np.asarray(_arrivals(trial, start, start + steps, steps.max()))[: len(mine)]
+    return table
+
+
+def _alike(order: Int[np.ndarray, "S"], length: Int[np.ndarray, "S"]) -> Iterator[Int[np.ndarray, "L"]]:
+    """Rests of like length, to pass side by side: all wait for the longest, so a few that are long go apart.
+
+    order: by length.
+    """
+
+    def cost(part):
+        # A step takes as long as 6 lanes of it, on a CPU.
+        return length[part[-1]] * (6 + padded_lanes(len(part))) if len(part) else 0
+
+    for part in evenly(order, 2 * LANES):
+        ways = [np.split(part, [len(part) - apart]) for apart in (0, 1, 4, 8, 16) if apart <= len(part)]
+        yield from (some for some in min(ways, key=lambda way: sum(map(cost, way))) if len(some))
 
 
 def own_misfit(arrival: Float[Array, "10 10"]) -> Float[Array, ""]:

@@ -13,17 +13,20 @@ from jaxsat.inertial.calibration import Calibration, calibrate
 from jaxsat.inertial.programs import UNOPTIMISED, Beside, stored_jit, trace_ahead, usable_cores
 from jaxsat.inertial.smoother import Filtered, closed_loop, filtered_size
 from jaxsat.inertial.strapdown import NavState, Samples
-from jaxsat.saturation.arrival import arrivals
+from jaxsat.saturation.arrival import arrival_table
 from jaxsat.saturation.experience import Heard, experienced
 from jaxsat.saturation.layout import (
+    LANES,
     Arrays,
     Sizes,
     Trial,
     Values,
     bucket,
     count_values,
+    evenly,
     gather,
     pad,
+    padded_lanes,
     padded_sizes,
 )
 from jaxsat.saturation.methods import Options, SegmentFill, solve_segment
@@ -34,9 +37,6 @@ from jaxsat.signals.rests import Segments
 Progress = Callable[[int, int], None]
 """Called with (segments done, segments in all)."""
 
-# So many segments are solved at once at most, and as many on each other core; more would gain nothing on a CPU and
-# wait for the slowest.
-LANES = 32
 # `map` holds some matrices of values × values for each: of all together one has no more entries than of 32 × 512².
 ENTRIES = LANES * 512**2
 # Gauss-Newton steps from no calibration: a third changes no digit that is reported.
@@ -153,7 +153,8 @@ def solve_segments(
 ) -> tuple[SegmentFill, Values]:
     """Some segments of a recording side by side, from the filtered states at their departures.
 
-    filled: the signal to begin with, `trial.signal` for none; prior: what `signal_prior` says; None for methods other than `map`.
+    filled: the signal to begin with, `trial.signal` where nothing is known; prior: what `signal_prior` says, None for
+    methods other than `map`.
     """
 
     def solve(state, covariance, table, departure, arrival):
@@ -193,54 +194,12 @@ _prior = stored_jit(signal_prior, UNOPTIMISED)
 _experienced = stored_jit(experienced)
 
 
-@stored_jit
-def _arrivals(trial: Trial, start, end, longest):
-    return arrivals(Samples(trial.signal, trial.period, trial.variance), trial.rows, start, end, longest)
-
-
-def arrival_table(trial: Trial, segments: Segments) -> Float[np.ndarray, "S 10 10"]:
-    """Λ of every segment's arrival; zeros where no rest follows. Independent of δ: rests do not saturate."""
-    # A segment without a departure has no known start, so its arrival tells nothing about it.
-    length = np.where(segments.departure >= 0, segments.rest_end - segments.arrival, 0)
-    table = np.zeros((len(segments), 10, 10))
-    for mine in _alike(np.argsort(length), length):
-        lanes = _lanes(len(mine))
-        start, steps = pad(segments.arrival[mine], lanes), pad(length[mine], lanes)
-        table[mine] = np.asarray(_arrivals(trial, start, start + steps, steps.max()))[: len(mine)]
-    return table
-
-
-def _alike(order: Int[np.ndarray, "S"], length: Int[np.ndarray, "S"]) -> Iterator[Int[np.ndarray, "L"]]:
-    """Rests of like length side by side: all wait for the longest, so a few that are long go apart.
-
-    order: by length.
-    """
-
-    def cost(part):
-        # A step takes as long as 6 lanes of it, on a CPU.
-        return length[part[-1]] * (6 + _lanes(len(part))) if len(part) else 0
-
-    for part in _evenly(order, 2 * LANES):
-        ways = [np.split(part, [len(part) - apart]) for apart in (0, 1, 4, 8, 16) if apart <= len(part)]
-        yield from (some for some in min(ways, key=lambda way: sum(map(cost, way))) if len(some))
-
-
-def _evenly(indices: Int[np.ndarray, "S"], most: int) -> list[Int[np.ndarray, "L"]]:
-    """In the fewest parts of at most so many."""
-    return np.array_split(indices, max(1, -(-len(indices) // most)))
-
-
-def _lanes(count: int) -> int:
-    """A few numbers, so that few programs are compiled: 1, 4, 8, 16, 24, …"""
-    return bucket(count, 1) if count <= 4 else -(-count // 8) * 8
-
-
 def _solve_some(
     calibrated: Trial, filled, departures, table, segments: Segments, prior, options, chunk
 ) -> tuple[SegmentFill, Values]:
     """Solve some segments, of `solved_together`, padded to a number of lanes; departures, table: of all segments."""
     mine, sizes = chunk
-    lanes = _lanes(len(mine))
+    lanes = padded_lanes(len(mine))
     given = (departures, table, segments.departure, segments.arrival)
     (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x[mine], lanes), given)
     found = _solve(calibrated, filled, states, covariances, table, departure, arrival, prior, sizes, options)
@@ -257,7 +216,7 @@ def trace_search(
     counts, programs, still = count_values(trial.sign, segments), {}, trial.signal[:, :3]
     here = eqx.tree_at(lambda t: t.rows.velocity, trial, still, is_leaf=lambda x: x is None)
     for mine, sizes in solved_together(*counts) if together else [_one_by_one(*counts)]:
-        lanes = _lanes(len(mine)) if together else 1
+        lanes = padded_lanes(len(mine)) if together else 1
         lane = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)
         lane = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), lane)
         if len(mine) and (lanes, sizes) not in programs:
@@ -299,7 +258,9 @@ def compensate_parallel(
             departures = jax.tree.map(lambda x: np.asarray(x)[first], (filtered.state, filtered.covariance))
             if sweep == 0:
                 prior = learned()
-            solve = partial(_solve_some, here, filled, departures, arriving.result(), segments, prior, options)
+            solve = partial(
+                _solve_some, here, filled, departures, arriving.result(), segments, prior, options
+            )
             for (mine, _), found in zip(chunks, beside.map(solve, chunks), strict=True):
                 fills.record(trial, mine, *found)
                 done += len(mine)
@@ -330,7 +291,7 @@ def solved_together(
         lanes = min(LANES, max(1, ENTRIES // padded_sizes(1, longest).values ** 2))
         alike, busy = busy[: 2 * lanes], busy[2 * lanes :]
         sizes = padded_sizes(int(samples[alike].max()), int(values[alike].max()))
-        yield from ((mine, sizes) for mine in _evenly(alike, lanes))
+        yield from ((mine, sizes) for mine in evenly(alike, lanes))
 
 
 def _one_by_one(
@@ -369,7 +330,9 @@ def compensate_sequential(
         at = departure
         departures = jax.tree.map(lambda x: np.stack([x] * len(segments)), (state, covariance))
         mine = np.array([index])
-        found = _solve_some(here, fills.signal - bias, departures, table, segments, prior, options, (mine, sizes))
+        found = _solve_some(
+            here, fills.signal - bias, departures, table, segments, prior, options, (mine, sizes)
+        )
         fills.record(trial, mine, *found)
         if progress:
             progress(count + 1, len(busy))

@@ -71,6 +71,21 @@ class Trial(eqx.Module):
 _SAMPLED = ("signal", "period", "variance", "sign", "clean")
 
 
+# So many segments are dealt with at once at most, and as many on each other core; more would gain nothing on a CPU
+# and wait for the slowest.
+LANES = 32
+
+
+def evenly(indices: Int[np.ndarray, "S"], most: int) -> list[Int[np.ndarray, "L"]]:
+    """In the fewest parts of at most so many."""
+    return np.array_split(indices, max(1, -(-len(indices) // most)))
+
+
+def padded_lanes(count: int) -> int:
+    """A few numbers, so that few programs are compiled: 1, 4, 8, 16, 24, …"""
+    return bucket(count, 1) if count <= 4 else -(-count // 8) * 8
+
+
 class Sizes(NamedTuple):
     """Padded lengths of a segment; equal ones share a compiled program."""
 
@@ -127,8 +142,8 @@ def gather(
 ) -> tuple[Segment, Values]:
     """One segment, padded; [departure, arrival) are its samples.
 
-    state, covariance: of the filter at departure; table: Λ of the arrival; prior: of the signal, for `map`; filled: the
-    signal to begin with, as measured if it is not given.
+    state, covariance: of the filter at departure; table: Λ of the arrival; prior: of the signal, for `map`; filled:
+    the signal to begin with, as measured if it is not given.
     """
     n, m = sizes
     count = len(trial.signal)

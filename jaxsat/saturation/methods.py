@@ -37,8 +37,8 @@ class Search(eqx.Module):
 def search_space(method: Compensation, segment: Segment, free_peak_time: bool = False) -> Search:
     """Method 1 (`direct`) searches every δ; method 2 the height of each gap, from half of its range.
 
-    `map` searches every δ but for those of gaps that are not to be filled. Both begin at `Segment.start`; where that is
-    nothing, `map` does where the signal prior alone puts it.
+    `map` searches every δ but for those of gaps that are not to be filled. Both begin at `Segment.start`; where that
+    is nothing, `map` does where the signal prior alone puts it.
     free_peak_time: method 2 also searches where in the gap the peak lies, instead of fixing it by Eq. 21.
     """
     if method == "map":

@@ -121,10 +121,9 @@ class _Sides:
         self.noise, self.quantum = np.array([known[j] for _, j in sides]).reshape(-1, 2).T
         lowest = (1 - max(DEPTHS)) * self.top
         self.high = np.flatnonzero(self.x >= np.repeat(lowest, lengths + 1))
-        peaks = [np.pad(_peaks(x), ((0, 1), (0, 0)), constant_values=i) for i, x in enumerate(sides.values())]
-        level, above, side = np.concatenate([np.zeros((3, 0)), *peaks], axis=1)
-        near = level + above >= lowest[side.astype(int)]
-        self.peaks, self.peak_side = np.stack([level, above])[:, near], side.astype(int)[near]
+        peaks = [_peaks(x, least) for x, least in zip(sides.values(), lowest, strict=True)]
+        self.peaks = np.concatenate([np.zeros((2, 0)), *peaks], axis=1)
+        self.peak_side = np.repeat(np.arange(self.count), [each.shape[1] for each in peaks])
 
     def above(self, level: Float[np.ndarray, "S"]) -> tuple[Int[np.ndarray, "R"], ...]:
         """Runs of samples at or above each signal's level, with two samples on either side: side, start, end."""
@@ -256,11 +255,14 @@ def _quantum(x: np.ndarray) -> float:
     return float(quantum) if np.mean(np.abs(ratio - np.round(ratio)) < 0.1) > 0.9 else 0.0
 
 
-def _peaks(x: np.ndarray) -> Float[np.ndarray, "2 P"]:
-    """Of each local maximum that may have been cut, its sample and how far above it a parabola may reach."""
+def _peaks(x: np.ndarray, least: float) -> Float[np.ndarray, "2 P"]:
+    """Of each local maximum that may have been cut, its sample and how far above it a parabola may reach; of those
+    only that may reach so high.
+    """
     i = 2 + np.flatnonzero((x[2:-2] >= x[1:-3]) & (x[2:-2] > x[3:-1]))
-    i = i[~_whole(x, i)]
-    return np.stack([x[i], (2 * x[i] - x[i - 1] - x[i + 1]) / 8])
+    peaks = np.stack([x[i], (2 * x[i] - x[i - 1] - x[i + 1]) / 8])
+    high = peaks.sum(axis=0) >= least
+    return peaks[:, high][:, ~_whole(x, i[high])]
 
 
 def _whole(x: np.ndarray, i: np.ndarray) -> np.ndarray:

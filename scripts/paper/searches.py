@@ -18,7 +18,8 @@ from jaxsat.inertial.smoother import smooth
 from jaxsat.inertial.strapdown import Samples
 from jaxsat.pipeline import estimate, search_options
 from jaxsat.preparation import Prepared, prepare
-from jaxsat.saturation.compensate import arrival_table, filter_trial, signal_prior
+from jaxsat.saturation.arrival import arrival_table
+from jaxsat.saturation.compensate import filter_trial, signal_prior
 from jaxsat.saturation.gap_shapes import Edges, edge_slope, peak, shape_value
 from jaxsat.saturation.layout import Sizes, Trial, gather
 from jaxsat.saturation.prior import Scales
