@@ -125,8 +125,8 @@ def search_options(config: Config, method: str) -> Options:
         cast(Compensation, method),
         chosen.solver,
         chosen.free_peak_time,
-        np.asarray(chosen.max_iterations),
-        np.asarray(chosen.tolerance),
+        jnp.asarray(chosen.max_iterations),
+        jnp.asarray(chosen.tolerance),
         constants_sd(config),
         prior_scales(config),
     )
@@ -134,7 +134,7 @@ def search_options(config: Config, method: str) -> Options:
 
 def prior_scales(config: Config) -> Scales:
     chosen = config.saturation
-    return Scales(np.asarray(chosen.prior_width, float), np.asarray(chosen.prior_share, float))
+    return Scales(jnp.asarray(chosen.prior_width, float), jnp.asarray(chosen.prior_share, float))
 
 
 def _estimate(recording: Recording, config: Config, progress: Progress) -> Estimate:

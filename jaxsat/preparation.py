@@ -112,10 +112,10 @@ def _rests(recording: Recording, config: Config, at_rail: Bool[np.ndarray, "N"])
     return rest & ~at_rail & ~recording.missing.all(axis=1)
 
 
-def constants_sd(config: Config) -> Float[np.ndarray, "9"] | None:
+def constants_sd(config: Config) -> Float[Array, "9"] | None:
     """None where no constant is wanted."""
     sd = config.smoother.constants_sd
-    return np.asarray(sd) if any(sd) else None
+    return jnp.asarray(sd) if any(sd) else None
 
 
 def _calibrate_by_rests(trial: Trial, config: Config) -> Calibration:
@@ -169,7 +169,7 @@ def _trial(
     # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
     # controller of `orientation` where that is so long that its offset would do more than the controller errs.
     q_nb = _between(up, np.array([0.0, 0.0, 1.0]))
-    velocity, tilt = np.zeros(3), noise.initial_tilt_sd**2
+    velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
     drifted = (LEFT_OFFSET_SD * first * T) ** 2 + density[:3].max() ** 2 * first * T
     if first * T > LATEST_FIRST_REST:
         tilt += min(drifted, MOVING_START_TILT_SD**2)
@@ -188,11 +188,11 @@ def _trial(
     arrived = np.concatenate([[False], rest[1:] & ~rest[:-1]]) & (np.arange(n) > first)
     mode = config.height.mode
     rows = Rows(
-        rest=rest,
-        velocity_variance=np.full(n, noise.rest_velocity_sd**2),
-        height=arrived if mode == "zero" else None,
-        height_variance=np.full(n, config.height.sd**2),
-        velocity=np.zeros((n, 3)),
+        rest=jnp.asarray(rest),
+        velocity_variance=jnp.full(n, noise.rest_velocity_sd**2),
+        height=jnp.asarray(arrived) if mode == "zero" else None,
+        height_variance=jnp.full(n, config.height.sd**2),
+        velocity=jnp.zeros((n, 3)),
     )
     trial = Trial(
         signal=signal,

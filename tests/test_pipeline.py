@@ -284,6 +284,10 @@ def test_a_recording_without_rest_is_told_what_it_supports():
     ) as caught:
         estimate(never)
     assert "\n" not in str(caught.value)
+    # What makes no sense is said first, whatever came of it.
+    degrees = never.with_signal(never.signal * np.repeat([180.0 / np.pi, 1.0], 3))
+    with pytest.raises(InputError, match="give --gyr-unit deg/s"):
+        estimate(degrees)
 
 
 @pytest.mark.parametrize("offset_sd", [1e-3, 0.1], ids=["gyroscope", "controller"])
