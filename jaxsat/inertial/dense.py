@@ -42,6 +42,20 @@ def product(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k
     return sum(terms[1:], terms[0])
 
 
+def total(x: Float[Array, "n *k"]) -> Float[Array, "*k"]:
+    """The sum over the leading axis.
+
+    Compiled for a CPU, `jnp.sum` adds one term after the other, each waiting for the last; halves are added side by
+    side.
+    """
+    odd = []
+    while len(x) > 8:
+        half = len(x) // 2
+        odd += [x[-1]] if len(x) % 2 else []
+        x = x[:half] + x[half : 2 * half]
+    return sum(odd, jnp.sum(x, axis=0))
+
+
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """x of matrix @ x = right with a positive definite matrix."""
     return _solve_positive(matrix, right)

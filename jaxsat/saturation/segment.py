@@ -85,6 +85,8 @@ class Condensed(eqx.Module):
     element: Int[Array, "m"]
     channel: Int[Array, "m"]
     sign: Float[Array, "m"]
+    place: Int[Array, "6 M1"]
+    """Which of the saturated values each sample of `signal` is; m for none."""
     velocity: Vector
     """At departure."""
     height: Float[Array, ""]
@@ -131,6 +133,13 @@ def condense(segment: Segment) -> Condensed:
     values, vectors = eigh(segment.arrival[:6, :6])
     one = jnp.ones_like(segment.height_variance)
     variance = pick(segment.variance)
+    # Saturated values come sample by sample, channel by channel, those that pad last.
+    count, ends = len(segment.sign), 6 * (len(segment.cut) + 1)
+    element, channel = segment.element.astype(int), segment.channel.astype(int)
+    order = jnp.where(segment.sign != 0.0, 6 * element + channel, ends)
+    asked = jnp.arange(ends).reshape(-1, 6).T
+    first = jnp.searchsorted(order, asked)
+    place = jnp.where(jnp.append(order, ends)[first] == asked, first, count)
     return Condensed(
         stretches=parts,
         signal=pick(segment.signal).T,
@@ -139,6 +148,7 @@ def condense(segment: Segment) -> Condensed:
         element=segment.element,
         channel=segment.channel,
         sign=segment.sign,
+        place=place,
         velocity=to_body.rotate(Vector.of(segment.departure.velocity)),
         height=segment.departure.position[2],
         up=R(Vector(0.0, 0.0, one)),
@@ -156,9 +166,13 @@ def _turned(R: Matrix, columns: Matrix) -> Matrix:
     )
 
 
-def _pass(condensed: Condensed, delta: Float[Array, "m"]) -> Passage:
-    """The motion with the compensated signal ȳ = y + s·δ (Eq. 17)."""
-    signal = condensed.signal.at[condensed.channel, condensed.element].add(condensed.sign * delta)
+def _compensated(condensed: Condensed, delta: Float[Array, "m"]) -> Float[Array, "6 M1"]:
+    """ȳ = y + s·δ (Eq. 17). Picked by its place, since to add to places takes a CPU a loop over all of them."""
+    return condensed.signal + jnp.append(condensed.sign * delta, 0.0)[condensed.place]
+
+
+def _pass(condensed: Condensed, signal: Float[Array, "6 M1"]) -> Passage:
+    """The motion with a compensated signal."""
     return passage(
         condensed.stretches,
         Vector(*signal[:3]),
@@ -267,14 +281,14 @@ def _quadratic(arrival: Matrix) -> tuple[Matrix, Matrix, Matrix]:
 
 
 def _pulled(
-    delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""], inner: _Inner
+    signal: Float[Array, "6 M1"], condensed: Condensed, gravity: Float[Array, ""], inner: _Inner
 ) -> Scalar:
-    """A function with the slope of f where `inner` was taken, its multipliers held (envelope theorem).
+    """A function of the compensated signal with the slope of f where `inner` was taken (envelope theorem).
 
     λ·m + lean·γ + κ·z + ½ [x; γ]ᵀΛ[x; γ] − ½ λᵀPλ − ½ κ²σ² with what multiplies m, γ, z, Λ, P and σ² held: what P
     says along one direction needs no matrix.
     """
-    motion = _pass(condensed, delta)
+    motion = _pass(condensed, signal)
     at = _arrive(condensed, motion, gravity)
     slope, lean = inner.slope.entries(), inner.lean.entries()
     back = at.turn.T
@@ -303,7 +317,7 @@ def value_and_root(
     delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]
 ) -> tuple[Float[Array, ""], tuple[Float[Array, "m"], ...], tuple[Float[Array, "m"], ...]]:
     """f(δ) of Eq. 18, columns of A with A Aᵀ its Gauss-Newton Hessian, and what each δ does to [θ, v] at arrival."""
-    motion = _pass(condensed, delta)
+    motion = _pass(condensed, _compensated(condensed, delta))
     at = _arrive(condensed, motion, gravity)
     inner = _inner(condensed, motion, at)
     effect = _effect(condensed, motion, at)
@@ -314,11 +328,13 @@ def value_gradient_root(
     delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, "m"], tuple[Float[Array, "m"], ...]]:
     """f(δ), its gradient, and the columns of A as of `value_and_root`."""
-    inner, columns = _evaluated_once(delta, condensed, gravity)
-    return inner.value, jax.grad(_pulled)(delta, condensed, gravity, inner), columns
+    signal = _compensated(condensed, delta)
+    inner, columns = _evaluated_once(signal, condensed, gravity)
+    slope = jax.grad(_pulled)(signal, condensed, gravity, inner)
+    return inner.value, condensed.sign * slope[condensed.channel, condensed.element], columns
 
 
-def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple[Array, ...]]:
+def _evaluated_once(signal, condensed: Condensed, gravity) -> tuple[_Inner, tuple[Array, ...]]:
     """The inner minimum and the columns of A, in memory.
 
     The inner minimum is a thousand operations for a few numbers. XLA would fuse them into the loops over samples
@@ -326,7 +342,7 @@ def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple
     once must not be known when it is compiled. (On a CPU `optimization_barrier` is gone before anything is fused.)
     """
 
-    once = delta, condensed, gravity
+    once = signal, condensed, gravity
     shapes = jax.eval_shape(_evaluated, *once)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     times = jnp.where(jnp.isnan(gravity), 2, 1)
@@ -336,8 +352,8 @@ def _evaluated_once(delta, condensed: Condensed, gravity) -> tuple[_Inner, tuple
 
 
 @jax.jit  # so that it is traced once
-def _evaluated(delta, condensed: Condensed, gravity):
-    motion = _pass(condensed, delta)
+def _evaluated(signal, condensed: Condensed, gravity):
+    motion = _pass(condensed, signal)
     at = _arrive(condensed, motion, gravity)
     inner = _inner(condensed, motion, at)
     return inner, _root(_effect(condensed, motion, at), inner)
@@ -372,6 +388,7 @@ def objective(delta: Float[Array, "m"], condensed: Condensed, gravity: Float[Arr
 
     Differentiable once, in δ and in all that is condensed.
     """
-    inner, _ = _evaluated_once(*jax.lax.stop_gradient((delta, condensed, gravity)))
-    pulled = _pulled(delta, condensed, gravity, inner)
+    signal = _compensated(condensed, delta)
+    inner, _ = _evaluated_once(*jax.lax.stop_gradient((signal, condensed, gravity)))
+    pulled = _pulled(signal, condensed, gravity, inner)
     return inner.value + (pulled - jax.lax.stop_gradient(pulled))

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsat.inertial.components import Cholesky, Matrix
-from jaxsat.inertial.dense import one_by_one, solve_positive
+from jaxsat.inertial.dense import one_by_one, solve_positive, total
 
 
 class Status(enum.IntEnum):
@@ -274,12 +274,11 @@ def box_step(
         y, pull, _, count = carry
         d = primal(pull)
         free = (d > low) & (d < high)
-        slope = Matrix.column(y[k] - jnp.sum(columns[k] * d) for k in rank)
+        slope = Matrix.column(y[k] - total(columns[k] * d) for k in rank)
         weighted = [jnp.where(free, column, 0.0) / damping for column in columns]
         curvature = Matrix(
             tuple(
-                tuple(jnp.sum(weighted[i] * columns[j]) + (1.0 if i == j else 0.0) for j in rank)
-                for i in rank
+                tuple(total(weighted[i] * columns[j]) + (1.0 if i == j else 0.0) for j in rank) for i in rank
             )
         ).mirrored()
         change = [-c for c in Cholesky(curvature).solve(slope).entries()]
@@ -288,7 +287,7 @@ def box_step(
         def rise(t):
             d = primal(pull + t * turned)
             along = sum((a + t * c) * c for a, c in zip(y, change, strict=True))
-            return along - jnp.sum(turned * d)
+            return along - total(turned * d)
 
         t = _root(jax.vmap(rise), fractions)
         size = jnp.sqrt(sum(c**2 for c in change)) / (1.0 + jnp.sqrt(sum(a**2 for a in y)))
