@@ -180,8 +180,9 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
                 for extra in (fills.slack, fills.variance)
             )
         path, ignoring = path.on_ground(ground), ignoring.on_ground(ground)
-        found_from = trial, config, calibration, taken.signal, taken.variance
-        doubting = beside.submit(calibration_in_doubt, *found_from)
+        doubting = beside.submit(
+            calibration_in_doubt, trial, config, calibration, taken.signal, taken.variance
+        )
         standing = None if fills is None else beside.submit(_path, ignoring, config)
         found = _path(path, config)
         calibration = doubting.result()
@@ -191,10 +192,12 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         told = grounded.rows.height is not None and found.floor is None
         common = doubt(config, prepared.gyr_offset_sd, calibration, told)
         n = len(recording)
-        states = [np.asarray(x)[:n] for x in (found.state.q_nb, found.state.position, found.state.velocity)]
+        q_nb, position, velocity = (
+            np.asarray(x)[:n] for x in (found.state.q_nb, found.state.position, found.state.velocity)
+        )
         rates = np.asarray(sure.signal)[:n, :3]
-        given = *states, rates, prepared.rest, recording.period, common
-        errors = beside.submit(lambda: outer(common_errors(*given)))
+        rested = prepared.rest, recording.period
+        errors = beside.submit(lambda: outer(common_errors(q_nb, position, velocity, rates, *rested, common)))
         covariance = np.asarray(_covariance(found, grounded))[:n] + errors.result()
         standard = found if standing is None else standing.result()
     clock.lap("smoother")
@@ -215,9 +218,9 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         config=config,
         trajectory=Trajectory(
             time=recording.time,
-            q_nb=states[0],
-            position=states[1],
-            velocity=states[2],
+            q_nb=q_nb,
+            position=position,
+            velocity=velocity,
             covariance=covariance,
         ),
         problem=sure,

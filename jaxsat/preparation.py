@@ -168,7 +168,7 @@ def _trial(
 
     # Attitude in the first rest from gravity, heading zero; back to the first sample by the gyroscope, or by the PI
     # controller of `orientation` where that is so long that its offset would do more than the controller errs.
-    q_nb = _between(up, np.array([0.0, 0.0, 1.0]))
+    q_nb = _between(jnp.asarray(up), jnp.array([0.0, 0.0, 1.0]))
     velocity, tilt = jnp.zeros(3), noise.initial_tilt_sd**2
     drifted = (LEFT_OFFSET_SD * first * T) ** 2 + density[:3].max() ** 2 * first * T
     if first * T > LATEST_FIRST_REST:

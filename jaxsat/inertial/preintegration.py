@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsat.inertial.components import Matrix, Quaternion, Scalar, Vector
-from jaxsat.inertial.dense import total
 
 _STILL = Quaternion(1.0, 0.0, 0.0, 0.0)
 
@@ -37,7 +36,7 @@ class SensorNoise(eqx.Module):
 
     def sum(self) -> "SensorNoise":
         """Of all stretches (leading axis)."""
-        return jax.tree.map(total, self)
+        return jax.tree.map(lambda x: jnp.sum(x, axis=0), self)
 
     def covariance(self) -> Matrix:
         """Of [θ, v] or [θ, v, r] at the end, in the frame of the start; [x×][y×]ᵀ = (x·y)I − y xᵀ."""
@@ -258,7 +257,7 @@ class Passage(eqx.Module):
         force = pull[0]
         if len(pull) == 2:
             force = force + pull[1] * (0.5 * self.period + self.left)
-        return total(stretches + c * behind.dot(behind) + a * force.dot(force))
+        return jnp.sum(stretches + c * behind.dot(behind) + a * force.dot(force))
 
 
 def passage(
