@@ -198,7 +198,9 @@ def _estimate(recording: Recording, config: Config, progress: Progress) -> Estim
         rates = np.asarray(sure.signal)[:n, :3]
         rested = prepared.rest, recording.period
         errors = beside.submit(lambda: outer(common_errors(q_nb, position, velocity, rates, *rested, common)))
-        covariance = np.asarray(_covariance(found, grounded))[:n] + errors.result()
+        known = np.asarray(_covariance(found, grounded))[:n]
+        covariance = errors.result()
+        covariance += known
         standard = found if standing is None else standing.result()
     clock.lap("smoother")
 
