@@ -9,8 +9,9 @@ f(δ) cheap and exact; the sample-by-sample filter is their oracle in the tests:
    in that frame, the rows of the rest cost ½ [m; γ]ᵀ Λ [m; γ], and Λ is built once per recording.
 
 The minimum over m with the arriving covariance P needs no inverse of P, so singular priors are fine. With
-Λ_mm = G Gᵀ, h = Λ_mγ γ, u = Λ_mm m + h at the mean and λ = (I + Λ_mm P)⁻¹ u, which is u − G(I + GᵀPG)⁻¹GᵀPu,
-f = ½ xᵀΛ_mm x + hᵀx + ½ γᵀΛ_γγ γ + ½ λᵀPλ at x = m − Pλ.
+Λ = [G; K][G; K]ᵀ + [0, 0; 0, C], which leaves Λ_mγ no other place, w = Gᵀm + Kᵀγ at the mean and
+λ = G(I + GᵀPG)⁻¹w, f = ½ |Gᵀx + Kᵀγ|² + ½ γᵀCγ + ½ λᵀPλ at x = m − Pλ. (Λ_mm m + Λ_mγ γ is a difference of
+numbers so large that the gradient was rounded a thousand times as much.)
 λ is also the slope of f in m, and −½λλᵀ that in P: at the inner minimum only the direct dependence counts.
 """
 
@@ -99,6 +100,10 @@ class Condensed(eqx.Module):
     """Λ."""
     root: Matrix
     """G of Λ_mm = G Gᵀ."""
+    cross: Matrix
+    """K of Λ_mγ = G Kᵀ."""
+    rest: Matrix
+    """C = Λ_γγ − K Kᵀ."""
     height_row: tuple[Bool[Array, ""], Float[Array, ""]] | None
     """Whether there is one, and its variance."""
 
@@ -131,6 +136,11 @@ def condense(segment: Segment) -> Condensed:
     size = 9 if position else 6
     P = Matrix.of(P[:size, :size])
     values, vectors = eigh(segment.arrival[:6, :6])
+    root = jnp.sqrt(jnp.maximum(values, 0.0))
+    # Of what the rest does not see, turns about gravity, Λ_mγ is rounding.
+    seen = values > 1e-14 * values[-1]
+    inverse = jnp.where(seen, 1.0 / jnp.where(seen, root, 1.0), 0.0)
+    cross = segment.arrival[6:, :6] @ (vectors * inverse[None])
     one = jnp.ones_like(segment.height_variance)
     variance = pick(segment.variance)
     # Saturated values come sample by sample, channel by channel, those that pad last.
@@ -154,7 +164,9 @@ def condense(segment: Segment) -> Condensed:
         up=R(Vector(0.0, 0.0, one)),
         covariance=_turned(R, _turned(R, P).T).mirrored(),
         arrival=Matrix.of(segment.arrival),
-        root=Matrix.of(vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]),
+        root=Matrix.of(vectors * root[None]),
+        cross=Matrix.of(cross),
+        rest=Matrix.of(segment.arrival[6:, 6:] - cross @ cross.T),
         height_row=None if segment.height is None else (segment.height, segment.height_variance),
     )
 
@@ -248,36 +260,27 @@ def _inner(condensed: Condensed, motion: Passage, at: _Arrival) -> _Inner:
     mean = Matrix.column((*at.turn(theta), *(at.velocity + at.turn(change))))
     gamma = Matrix.column((*at.gravity, jnp.ones_like(condensed.height)))
     P = P.part(slice(6), slice(6))
-    information, cross, constant = _quadratic(condensed.arrival)
-    h = cross @ gamma
-    u = _turned(at.turn.T, information @ mean + h)
-    # Turning G and u to the frame of P is cheaper than turning P to theirs.
+    # Turning G to the frame of P is cheaper than turning P to that of G.
     root = _turned(at.turn.T, condensed.root)
-    seen = P @ root
-    inner = Cholesky((Matrix.identity(6) + root.T @ seen).mirrored())
-    slope = u - root @ inner.solve(seen.T @ u)
+    inner = Cholesky((Matrix.identity(6) + root.T @ (P @ root)).mirrored())
+    pull = condensed.cross.T @ gamma
+    slope = root @ inner.solve(condensed.root.T @ mean + pull)
     correction = P @ slope
     conditioned = mean - _turned(at.turn, correction)
     # Summed up at the minimiser, so that an error of λ counts in second order only.
-    misfit = conditioned.T @ (information @ conditioned + h * 2.0) + gamma.T @ constant @ gamma
-    value = cost + 0.5 * (misfit + slope.T @ correction)[0, 0]
+    misfit, left = condensed.root.T @ conditioned + pull, condensed.rest @ gamma
+    value = cost + 0.5 * (misfit.T @ misfit + gamma.T @ left + slope.T @ correction)[0, 0]
     height_slope = 0.0
     if condensed.height_row is not None:
         height_slope = weight * (at.height - (gain.part(slice(6), slice(1)).T @ slope)[0, 0])
     return _Inner(
         value=cast(Array, value),
         slope=_turned(at.turn, slope),
-        lean=cross.T @ conditioned + constant @ gamma,
+        lean=condensed.cross @ misfit + left,
         height_slope=height_slope,
         met=Matrix(conditioned.rows + gamma.rows),
         root=inner.forward(condensed.root.T).T,
     )
-
-
-def _quadratic(arrival: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """Λ_mm, Λ_mγ and Λ_γγ."""
-    m, gamma = slice(0, 6), slice(6, 10)
-    return arrival.part(m, m), arrival.part(m, gamma), arrival.part(gamma, gamma)
 
 
 def _pulled(
