@@ -47,7 +47,7 @@ from jaxsat.inertial.smoother import smooth_about
 from jaxsat.pipeline import _covariance, _path, estimate
 from jaxsat.preparation import find_ground, prepare
 from jaxsat.saturation.compensate import filter_trial
-from jaxsat.saturation.layout import gather
+from jaxsat.saturation.layout import Ends, gather
 from jaxsat.saturation.segment import condense, value_gradient_root
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.readers import read
@@ -65,8 +65,8 @@ def objective_vs_strapdown() -> Iterator[Row]:
         filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
         at = batch.departure[0]
         state, covariance, _ = jax.tree.map(lambda x: x[at], filtered)
-        found, _ = gather(trial, at, batch.arrival[0], state, covariance, batch.table(trial)[0], batch.sizes)
-        return condense(found)
+        ends = Ends(at, batch.arrival[0], state, covariance, batch.table(trial)[0])
+        return condense(gather(trial, ends, batch.sizes)[0])
 
     condensed = jax.jit(jax.vmap(segment))(jax.tree.map(jnp.asarray, batch.trials))
     delta = jnp.ones((256, batch.sizes.values))

@@ -18,7 +18,7 @@ from jaxsat.pipeline import search_options
 from jaxsat.preparation import prepare
 from jaxsat.saturation.arrival import arrivals
 from jaxsat.saturation.compensate import filter_trial, solve_segments
-from jaxsat.saturation.layout import Sizes, Trial, padded_sizes
+from jaxsat.saturation.layout import Ends, Sizes, Trial, padded_sizes
 from jaxsat.saturation.methods import Options
 from jaxsat.signals.recording import Recording
 from jaxsat.signals.rests import find_segments
@@ -123,18 +123,8 @@ def direct(trial: Trial, batch: Batch, whole: bool, options: Options = OPTIONS, 
     first = jax.tree.map(lambda x: x[:stop] if np.ndim(x) and len(x) == len(trial.period) else x, trial)
     filtered = filter_trial(first, first.signal, jnp.where(sure, 0.0, first.unfilled_variance))
     state, covariance, _ = jax.tree.map(lambda x: x[batch.departure], filtered)
-    return solve_segments(
-        trial,
-        trial.signal,
-        state,
-        covariance,
-        table,
-        batch.departure,
-        batch.arrival,
-        None,
-        batch.sizes,
-        options,
-    )
+    ends = Ends(batch.departure, batch.arrival, state, covariance, table)
+    return solve_segments(trial, trial.signal, ends, None, batch.sizes, options)
 
 
 # On a CPU as a sweep does it: on each core a part, none so large that it leaves the cache.

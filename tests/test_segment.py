@@ -48,6 +48,7 @@ def build(height: bool, departure=None) -> Segment:
 
 
 F = jax.jit(lambda delta, segment: objective(delta, condense(segment), problems.GRAVITY))
+GRADIENT = jax.jit(jax.grad(F))
 DELTA = jnp.asarray(np.random.default_rng(1).uniform(0.0, 2.0, 8))
 
 
@@ -69,13 +70,13 @@ def test_objective_and_gradient_equal_the_sample_by_sample_filter(height):
     segment = build(height)
     value, gradient = jax.jit(jax.value_and_grad(lambda d: oracle(d, height)))(DELTA)
     np.testing.assert_allclose(F(DELTA, segment), value, rtol=1e-10)
-    found = jax.jit(jax.grad(F))(DELTA, segment)
+    found = GRADIENT(DELTA, segment)
     np.testing.assert_allclose(found, gradient, atol=1e-10 * np.abs(gradient).max())
 
 
 def test_gradient_equals_central_differences_and_forward_mode():
     segment = build(False)
-    reverse = jax.jit(jax.grad(F))(DELTA, segment)
+    reverse = GRADIENT(DELTA, segment)
     forward = jax.jit(jax.jacfwd(F))(DELTA, segment)
     step = 1e-5
     numeric = [(F(DELTA + step * e, segment) - F(DELTA - step * e, segment)) / (2 * step) for e in np.eye(8)]
@@ -85,15 +86,31 @@ def test_gradient_equals_central_differences_and_forward_mode():
     assert not reverse[6:].any(), "padded values have no influence"
 
 
-def test_objective_does_not_depend_on_heading_or_position():
-    state, covariance = problems.departure()
-    covariance = jnp.diag(jnp.array([1e-4, 1e-4, 1e-4, 0, 0, 0, 1e-4, 1e-4, 1e-4]))
+SPUN = jnp.diag(jnp.array([1e-4, 1e-4, 1e-4, 0, 0, 0, 1e-4, 1e-4, 1e-4]))
+
+
+def heading_turned(state: NavState) -> NavState:
+    """The same motion in a world that is turned about the vertical, and elsewhere."""
     angle = 0.8
     spin = jnp.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     turned = add_error(state, jnp.array([0, 0, angle, 7.0, -2.0, 1.0, 0, 0, 0]))
-    turned = NavState(turned.q_nb, spin @ state.velocity, turned.position)
-    here, there = build(False, (state, covariance)), build(False, (turned, covariance))
+    return NavState(turned.q_nb, spin @ state.velocity, turned.position)
+
+
+def test_objective_does_not_depend_on_heading_or_position():
+    state, _ = problems.departure()
+    here, there = build(False, (state, SPUN)), build(False, (heading_turned(state), SPUN))
     np.testing.assert_allclose(F(DELTA, here), F(DELTA, there), rtol=1e-10)
+
+
+@pytest.mark.parametrize("uncertain", [1.0, 1e6])
+def test_gradient_keeps_its_digits_however_uncertain_the_departure(uncertain):
+    """Turned, the same numbers are rounded otherwise: what differs is rounding."""
+    state, _ = problems.departure()
+    here = build(False, (state, uncertain * SPUN))
+    there = build(False, (heading_turned(state), uncertain * SPUN))
+    gradient = GRADIENT(DELTA, here)
+    np.testing.assert_allclose(GRADIENT(DELTA, there), gradient, atol=1e-12 * np.abs(gradient).max())
 
 
 def test_padding_changes_nothing():
@@ -153,4 +170,4 @@ def test_no_rest_after_means_no_information():
         }
     )
     assert F(DELTA, blind) == 0.0
-    assert not jax.grad(F)(DELTA, blind).any()
+    assert not GRADIENT(DELTA, blind).any()

@@ -18,6 +18,7 @@ from jaxsat.saturation.experience import Heard, experienced
 from jaxsat.saturation.layout import (
     LANES,
     Arrays,
+    Ends,
     Sizes,
     Trial,
     Values,
@@ -142,26 +143,22 @@ def filter_trial(trial: Trial, signal: Float[Arrays, "N 6"], extra: Float[Arrays
 def solve_segments(
     trial: Trial,
     filled: Float[Arrays, "N 6"],
-    states: NavState,
-    covariances: Float[Arrays, "L s s"],
-    table: Float[Arrays, "L 10 10"],
-    departure: Int[Arrays, "L"],
-    arrival: Int[Arrays, "L"],
+    ends: Ends,
     prior: SignalPrior | None,
     sizes: Sizes,
     options: Options,
 ) -> tuple[SegmentFill, Values]:
-    """Some segments of a recording side by side, from the filtered states at their departures.
+    """Some segments of a recording side by side.
 
     filled: the signal to begin with, `trial.signal` where nothing is known; prior: what `signal_prior` says, None for
     methods other than `map`.
     """
 
-    def solve(state, covariance, table, departure, arrival):
-        segment, values = gather(trial, departure, arrival, state, covariance, table, sizes, prior, filled)
+    def solve(ends):
+        segment, values = gather(trial, ends, sizes, prior, filled)
         return solve_segment(segment, jnp.asarray(trial.gravity), options), values
 
-    return jax.vmap(solve)(states, covariances, table, departure, arrival)
+    return jax.vmap(solve)(ends)
 
 
 def signal_prior(trial: Trial, scales: Scales) -> SignalPrior:
@@ -194,16 +191,11 @@ _prior = stored_jit(signal_prior, UNOPTIMISED)
 _experienced = stored_jit(experienced)
 
 
-def _solve_some(
-    calibrated: Trial, filled, departures, table, segments: Segments, prior, options, chunk
-) -> tuple[SegmentFill, Values]:
-    """Solve some segments, of `solved_together`, padded to a number of lanes; departures, table: of all segments."""
+def _solve_some(calibrated: Trial, filled, ends: Ends, prior, options, chunk) -> tuple[SegmentFill, Values]:
+    """Solve some segments, of `solved_together`, padded to a number of lanes; ends: of all segments."""
     mine, sizes = chunk
-    lanes = padded_lanes(len(mine))
-    given = (departures, table, segments.departure, segments.arrival)
-    (states, covariances), table, departure, arrival = jax.tree.map(lambda x: pad(x[mine], lanes), given)
-    found = _solve(calibrated, filled, states, covariances, table, departure, arrival, prior, sizes, options)
-    return jax.block_until_ready(found)
+    ends = jax.tree.map(lambda x: pad(x[mine], padded_lanes(len(mine))), ends)
+    return jax.block_until_ready(_solve(calibrated, filled, ends, prior, sizes, options))
 
 
 def trace_search(
@@ -211,16 +203,16 @@ def trace_search(
 ) -> list[Callable[[], None]]:
     """What compiles the programs of `compensate_parallel` (together) or `compensate_sequential` that take longest."""
     size, prior = filtered_size(trial.rows), None
+    blank_ends = Ends(np.array(0), np.array(0), trial.prior, np.zeros((size, size)), np.zeros((10, 10)))
     if options.method == "map":
         prior = blank(len(trial.period), options.scales)
     counts, programs, still = count_values(trial.sign, segments), {}, trial.signal[:, :3]
     here = eqx.tree_at(lambda t: t.rows.velocity, trial, still, is_leaf=lambda x: x is None)
     for mine, sizes in solved_together(*counts) if together else [_one_by_one(*counts)]:
         lanes = padded_lanes(len(mine)) if together else 1
-        lane = (trial.prior, np.zeros((size, size)), np.zeros((10, 10)), 0, 0)
-        lane = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), lane)
+        ends = jax.tree.map(lambda x, lanes=lanes: np.broadcast_to(x, (lanes, *np.shape(x))), blank_ends)
         if len(mine) and (lanes, sizes) not in programs:
-            programs[lanes, sizes] = trace_ahead(_solve, here, trial.signal, *lane, prior, sizes, options)
+            programs[lanes, sizes] = trace_ahead(_solve, here, trial.signal, ends, prior, sizes, options)
     return list(programs.values())
 
 
@@ -258,9 +250,8 @@ def compensate_parallel(
             departures = jax.tree.map(lambda x: np.asarray(x)[first], (filtered.state, filtered.covariance))
             if sweep == 0:
                 prior = learned()
-            solve = partial(
-                _solve_some, here, filled, departures, arriving.result(), segments, prior, options
-            )
+            ends = Ends(segments.departure, segments.arrival, *departures, arriving.result())
+            solve = partial(_solve_some, here, filled, ends, prior, options)
             for (mine, _), found in zip(chunks, beside.map(solve, chunks), strict=True):
                 fills.record(trial, mine, *found)
                 done += len(mine)
@@ -329,10 +320,8 @@ def compensate_sequential(
         )
         at = departure
         departures = jax.tree.map(lambda x: np.stack([x] * len(segments)), (state, covariance))
-        mine = np.array([index])
-        found = _solve_some(
-            here, fills.signal - bias, departures, table, segments, prior, options, (mine, sizes)
-        )
+        ends, mine = Ends(segments.departure, segments.arrival, *departures, table), np.array([index])
+        found = _solve_some(here, fills.signal - bias, ends, prior, options, (mine, sizes))
         fills.record(trial, mine, *found)
         if progress:
             progress(count + 1, len(busy))

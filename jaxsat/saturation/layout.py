@@ -122,6 +122,21 @@ def count_values(
     return segments.arrival - start, total[segments.arrival] - total[start]
 
 
+class Ends(eqx.Module):
+    """What is known at both ends of a segment, or of several along a leading axis."""
+
+    departure: Int[Arrays, "*L"]
+    """Its first sample; negative for none."""
+    arrival: Int[Arrays, "*L"]
+    """The one after its last."""
+    state: NavState
+    """Of the filter at departure."""
+    covariance: Float[Arrays, "*L s s"]
+    """Of that state."""
+    table: Float[Arrays, "*L 10 10"]
+    """Λ of the arrival."""
+
+
 class Values(eqx.Module):
     """Where the saturated values of a segment lie in the recording; a padded one lies behind its end."""
 
@@ -131,23 +146,18 @@ class Values(eqx.Module):
 
 def gather(
     trial: Trial,
-    departure: Int[Array, ""],
-    arrival: Int[Array, ""],
-    state: NavState,
-    covariance: Float[Array, "s s"],
-    table: Float[Array, "10 10"],
+    ends: Ends,
     sizes: Sizes,
     prior: SignalPrior | None = None,
     filled: Float[Array, "N 6"] | None = None,
 ) -> tuple[Segment, Values]:
-    """One segment, padded; [departure, arrival) are its samples.
+    """One segment, padded.
 
-    state, covariance: of the filter at departure; table: Λ of the arrival; prior: of the signal, for `map`; filled:
-    the signal to begin with, as measured if it is not given.
+    prior: of the signal, for `map`; filled: the signal to begin with, as measured if it is not given.
     """
     n, m = sizes
-    count = len(trial.signal)
-    start = jnp.maximum(departure, 0)
+    count, arrival, covariance, table = len(trial.signal), ends.arrival, ends.covariance, ends.table
+    start = jnp.maximum(ends.departure, 0)
     at = start + jnp.arange(n)
     inside = at < arrival
     safe = jnp.minimum(at, count - 1)
@@ -190,7 +200,7 @@ def gather(
         start=begin,
         gap=gap,
         edges=edges,
-        departure=state,
+        departure=ends.state,
         departure_covariance=covariance,
         arrival=table,
         height=height,

@@ -9,9 +9,9 @@ f(δ) cheap and exact; the sample-by-sample filter is their oracle in the tests:
    in that frame, the rows of the rest cost ½ [m; γ]ᵀ Λ [m; γ], and Λ is built once per recording.
 
 The minimum over m with the arriving covariance P needs no inverse of P, so singular priors are fine. With
-Λ = [G; K][G; K]ᵀ + [0, 0; 0, C], which leaves Λ_mγ no other place, w = Gᵀm + Kᵀγ at the mean and
-λ = G(I + GᵀPG)⁻¹w, f = ½ |Gᵀx + Kᵀγ|² + ½ γᵀCγ + ½ λᵀPλ at x = m − Pλ. (Λ_mm m + Λ_mγ γ is a difference of
-numbers so large that the gradient was rounded a thousand times as much.)
+Λ = [G; K][G; K]ᵀ + [0, 0; 0, C], w = Gᵀm + Kᵀγ at the mean and λ = G(I + GᵀPG)⁻¹w,
+f = ½ |Gᵀx + Kᵀγ|² + ½ γᵀCγ + ½ λᵀPλ at x = m − Pλ. (Solved for with Λ_mm itself, λ is a difference of numbers so
+large that the gradient is rounded hundreds of times as much.)
 λ is also the slope of f in m, and −½λλᵀ that in P: at the inner minimum only the direct dependence counts.
 """
 
@@ -102,8 +102,8 @@ class Condensed(eqx.Module):
     """G of Λ_mm = G Gᵀ."""
     cross: Matrix
     """K of Λ_mγ = G Kᵀ."""
-    rest: Matrix
-    """C = Λ_γγ − K Kᵀ."""
+    own: Matrix
+    """C = Λ_γγ − K Kᵀ: what γ costs with the best m."""
     height_row: tuple[Bool[Array, ""], Float[Array, ""]] | None
     """Whether there is one, and its variance."""
 
@@ -166,7 +166,7 @@ def condense(segment: Segment) -> Condensed:
         arrival=Matrix.of(segment.arrival),
         root=Matrix.of(vectors * root[None]),
         cross=Matrix.of(cross),
-        rest=Matrix.of(segment.arrival[6:, 6:] - cross @ cross.T),
+        own=Matrix.of(segment.arrival[6:, 6:] - cross @ cross.T),
         height_row=None if segment.height is None else (segment.height, segment.height_variance),
     )
 
@@ -268,7 +268,7 @@ def _inner(condensed: Condensed, motion: Passage, at: _Arrival) -> _Inner:
     correction = P @ slope
     conditioned = mean - _turned(at.turn, correction)
     # Summed up at the minimiser, so that an error of λ counts in second order only.
-    misfit, left = condensed.root.T @ conditioned + pull, condensed.rest @ gamma
+    misfit, left = condensed.root.T @ conditioned + pull, condensed.own @ gamma
     value = cost + 0.5 * (misfit.T @ misfit + gamma.T @ left + slope.T @ correction)[0, 0]
     height_slope = 0.0
     if condensed.height_row is not None:

@@ -30,7 +30,7 @@ from jaxsat.saturation.compensate import (
     solve_segments,
 )
 from jaxsat.saturation.experience import Heard, experienced
-from jaxsat.saturation.layout import Arrays, Sizes, Trial, pad
+from jaxsat.saturation.layout import Arrays, Ends, Sizes, Trial, pad
 from jaxsat.saturation.methods import Options
 from jaxsat.saturation.solvers import Status
 from jaxsat.signals.recording import sensor_changes
@@ -331,9 +331,8 @@ def score(
             filtered = filter_trial(here, filled, extra)
             states, covariances, _ = jax.tree.map(lambda x: x[at], filtered)
             table = _table(case, here) if bare is None else bare
-            fill, values = solve_segments(
-                here, filled, states, covariances, table, case.departure, case.arrival, prior, sizes, option
-            )
+            ends = Ends(case.departure, case.arrival, states, covariances, table)
+            fill, values = solve_segments(here, filled, ends, prior, sizes, option)
             place = (values.sample, values.channel)
             way = sign.at[place].get(mode="fill", fill_value=0)
             filled = signal.at[place].add(way.astype(signal.dtype) * fill.delta, mode="drop")

@@ -21,7 +21,7 @@ from jaxsat.preparation import Prepared, prepare
 from jaxsat.saturation.arrival import arrival_table
 from jaxsat.saturation.compensate import filter_trial, signal_prior
 from jaxsat.saturation.gap_shapes import Edges, edge_slope, peak, shape_value
-from jaxsat.saturation.layout import Sizes, Trial, gather
+from jaxsat.saturation.layout import Ends, Sizes, Trial, gather
 from jaxsat.saturation.prior import Scales
 from jaxsat.saturation.segment import Condensed, Segment, condense, value_gradient_root
 from jaxsat.saturation.solvers import Box, projected_gauss_newton, projected_gradient
@@ -136,7 +136,7 @@ def _gathered(trial: Trial, departure, arrival, table, scales: Scales | None) ->
     filtered = filter_trial(trial, trial.signal, trial.unfilled_variance)
     state, covariance, _ = jax.tree.map(lambda x: x[departure], filtered)
     known = None if scales is None else signal_prior(trial, scales)
-    segment, _ = gather(trial, departure, arrival, state, covariance, table, SIZES, known)
+    segment, _ = gather(trial, Ends(departure, arrival, state, covariance, table), SIZES, known)
     return segment, condense(segment)
 
 
