@@ -247,10 +247,12 @@ def compensate_parallel(
             filled = fills.signal - np.asarray(calibration.constants)[None, :6]
             arriving = beside.submit(arrival_table, here, segments)
             filtered = filter_recording(here, filled, fills.variance)
-            departures = jax.tree.map(lambda x: np.asarray(x)[first], (filtered.state, filtered.covariance))
+            states, covariances = jax.tree.map(
+                lambda x: np.asarray(x)[first], (filtered.state, filtered.covariance)
+            )
             if sweep == 0:
                 prior = learned()
-            ends = Ends(segments.departure, segments.arrival, *departures, arriving.result())
+            ends = Ends(segments.departure, segments.arrival, states, covariances, arriving.result())
             solve = partial(_solve_some, here, filled, ends, prior, options)
             for (mine, _), found in zip(chunks, beside.map(solve, chunks), strict=True):
                 fills.record(trial, mine, *found)
@@ -319,8 +321,9 @@ def compensate_sequential(
             lambda x, last=last: np.asarray(x[last]), (filtered.state, filtered.covariance)
         )
         at = departure
-        departures = jax.tree.map(lambda x: np.stack([x] * len(segments)), (state, covariance))
-        ends, mine = Ends(segments.departure, segments.arrival, *departures, table), np.array([index])
+        states, covariances = jax.tree.map(lambda x: np.stack([x] * len(segments)), (state, covariance))
+        ends = Ends(segments.departure, segments.arrival, states, covariances, table)
+        mine = np.array([index])
         found = _solve_some(here, fills.signal - bias, ends, prior, options, (mine, sizes))
         fills.record(trial, mine, *found)
         if progress:
