@@ -86,7 +86,7 @@ def test_gradient_equals_central_differences_and_forward_mode():
     assert not reverse[6:].any(), "padded values have no influence"
 
 
-SPUN = jnp.diag(jnp.array([1e-4, 1e-4, 1e-4, 0, 0, 0, 1e-4, 1e-4, 1e-4]))
+SPREAD = jnp.diag(jnp.array([1e-4, 1e-4, 1e-4, 0, 0, 0, 1e-4, 1e-4, 1e-4]))
 
 
 def heading_turned(state: NavState) -> NavState:
@@ -99,7 +99,7 @@ def heading_turned(state: NavState) -> NavState:
 
 def test_objective_does_not_depend_on_heading_or_position():
     state, _ = problems.departure()
-    here, there = build(False, (state, SPUN)), build(False, (heading_turned(state), SPUN))
+    here, there = build(False, (state, SPREAD)), build(False, (heading_turned(state), SPREAD))
     np.testing.assert_allclose(F(DELTA, here), F(DELTA, there), rtol=1e-10)
 
 
@@ -107,8 +107,8 @@ def test_objective_does_not_depend_on_heading_or_position():
 def test_gradient_keeps_its_digits_however_uncertain_the_departure(uncertain):
     """Turned, the same numbers are rounded otherwise: what differs is rounding."""
     state, _ = problems.departure()
-    here = build(False, (state, uncertain * SPUN))
-    there = build(False, (heading_turned(state), uncertain * SPUN))
+    here = build(False, (state, uncertain * SPREAD))
+    there = build(False, (heading_turned(state), uncertain * SPREAD))
     gradient = GRADIENT(DELTA, here)
     np.testing.assert_allclose(GRADIENT(DELTA, there), gradient, atol=1e-12 * np.abs(gradient).max())
 

@@ -156,7 +156,7 @@ def test_neither_memory_nor_devices_nor_cores_change_a_number(table, trials, cal
     assert all(len(place.device_set) == DEVICES for place in places)
     assert DEVICES == 1 or not places[0].is_fully_replicated
     assert steps == [("sweep", done, 6) for done in range(DEVICES, 7, DEVICES)]
-    # Programs of other shapes round otherwise; what no rest sees of a filled value is rounding over damping.
+    # Programs of other shapes round otherwise, and steps carry that where no rest sees it.
     np.testing.assert_allclose(chunked["fill_rmse_gyr"], table["fill_rmse_gyr"], atol=1e-8)
     chunked, expected = (t.drop(columns="fill_rmse_gyr") for t in (chunked, table))
     pd.testing.assert_frame_equal(chunked, expected, rtol=1e-9, atol=1e-9)

@@ -165,9 +165,8 @@ def _solution(box: Box, u, at, count, stalled) -> Solution:
 
 
 # Damping, relative to a scaled diagonal of 1: where it starts, the least there is (or the tolerance where that is
-# less: a direction that is damped by more than its curvature settles slowly), and where a search gives up. In
-# directions that the data do not see, the rounding of the gradient over the damping is a step: with the least at 1e-6
-# it moved filled values by 1e-4 rad/s, with 1e-2 by 1e-9, for the same number of steps.
+# less: a direction that is damped by more than its curvature settles slowly), and where a search gives up. With less
+# of it, what the data do not see moves further: the value bends, so every step has a little of that in it.
 _DAMPING = (1.0, 1e-2, 1e6)
 # The least with a prior.
 _UNDAMPED = 1e-9
